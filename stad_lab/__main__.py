@@ -1,0 +1,115 @@
+"""The command line: python -m stad_lab train | evaluate | ship."""
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+from stad_lab.autoencoder import VARIANTS
+from stad_lab.evaluation import describe, evaluate, save_evaluation
+from stad_lab.pipeline import PRETRAINED, STAGES, ship, train
+from stad_lab.settings import PRESETS, Settings
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The whole command line with its help."""
+    parser = argparse.ArgumentParser(
+        prog="python -m stad_lab", description="Teach a car to drive inside its own model of the world (STAD)."
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+
+    variant = argparse.ArgumentParser(add_help=False)
+    variant.add_argument(
+        "--variant",
+        required=True,
+        help=f"which pictures V sees and redraws: {', '.join(VARIANTS)} (frame is World Models; input adds the"
+        " difference image to what V sees, output to what it redraws)",
+    )
+
+    command = commands.add_parser(
+        "train",
+        parents=[variant],
+        help="collect, train V, train M, evolve C",
+        description="Run all four stages. Stop it when you like; the same command goes on where it stopped.",
+    )
+    command.add_argument(
+        "--settings", help=f"preset: {', '.join(PRESETS)}; default: $STAD_LAB_SETTINGS, or else laptop"
+    )
+    command.add_argument("--out", required=True, type=Path, help="folder of the run, for example runs/input")
+    command.add_argument("--rollouts", type=Path, help="folder of the rollouts, to share them; default OUT/rollouts")
+    command.add_argument("--until", default=STAGES[-1], help=f"last stage to run: {', '.join(STAGES)}; default all")
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="change one setting of the preset, for example --set stride=2; may be repeated."
+        f" The settings: {', '.join(field.name for field in dataclasses.fields(Settings))}",
+    )
+
+    command = commands.add_parser(
+        "evaluate",
+        parents=[variant],
+        help="drive an agent on official, unseen tracks",
+        description="Drive an agent on Gymnasium's own CarRacing-v3 and print mean, deviation, interval and share"
+        " above 900; every episode goes into a JSON file.",
+    )
+    command.add_argument("--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab")
+    command.add_argument("--episodes", type=int, default=100, help="number of tracks, default 100")
+    command.add_argument("--first-track", type=int, default=0, help="seed of the first track, default 0")
+    command.add_argument("--fast", action="store_true", help="draw with the fast renderer (not for reports)")
+    command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
+    command.add_argument("--json", type=Path, help="where to write the result; default evaluation.json in the run")
+
+    command = commands.add_parser(
+        "ship", parents=[variant], help="copy a run's weights and records to stad_lab/pretrained"
+    )
+    command.add_argument("--path", type=Path, required=True, help="folder of the run")
+    return parser
+
+
+def changed_settings(preset: str | None, changes: list[str]) -> Settings:
+    """A preset with NAME=VALUE changes. Raises ValueError for a change that cannot be read."""
+    kinds = {field.name: field.type for field in dataclasses.fields(Settings)}
+    values = {}
+    for change in changes:
+        name, equals, text = change.partition("=")
+        if not equals:
+            raise ValueError(f"--set {change!r}: expected NAME=VALUE, for example stride=2")
+        try:
+            values[name] = text if kinds.get(name, str) is str else kinds[name](json.loads(text))
+        except (ValueError, TypeError):
+            raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}") from None
+    return Settings.preset(preset, **values)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
+    options = build_parser().parse_args(arguments)
+    try:
+        if options.command == "train":
+            settings = changed_settings(options.settings, options.set)
+            if not train(options.variant, settings, options.out, options.rollouts, options.until):
+                print(f"{options.out} is finished: nothing to do")
+        elif options.command == "evaluate":
+            result = evaluate(
+                options.variant, options.path, options.episodes, options.first_track, options.fast, options.processes
+            )
+            file = options.json or (options.path or PRETRAINED / options.variant) / "evaluation.json"
+            save_evaluation(file, result)
+            print(describe(result))
+            print(f"  every episode: {file}")
+        elif options.command == "ship":
+            print(f"shipped to {ship(options.variant, options.path)}")
+    except (ValueError, FileNotFoundError, FloatingPointError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on from here", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

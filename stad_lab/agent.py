@@ -1,0 +1,189 @@
+"""The agent: V, M and C together. It sees observations and gives actions, for one car or for many in step.
+
+At every frame: V makes z of the frame and its difference image; C makes the action of z and M's memory h; M takes in z
+and the action. C sees the mean mu of z, not a sample: driving has no use for the noise.
+"""
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from stad_lab.autoencoder import REMEDY, AutoEncoder, check_variant, load_autoencoder, to_pictures
+from stad_lab.car_racing import MAX_FRAMES, make_env
+from stad_lab.checkpoints import load_tensors, save_tensors
+from stad_lab.controller import check_parameters, control, parameter_count
+from stad_lab.frames import FrameMemory, to_frame
+from stad_lab.mdn_rnn import MDNRNN, load_mdn_rnn
+
+PRETRAINED = Path(__file__).parent / "pretrained"
+
+
+class Agent:
+    """V + M + C.
+
+    Attributes:
+        latents: z of the last frame, float32 (cars, latent_size); None before the first.
+        hidden: M's memory h that C saw with it, float32 (cars, hidden_size).
+
+    Args:
+        parameters: of C, (parameters,) or one row for each car (cars, parameters).
+        stride: k of the difference image.
+        crop_bar: whether V was trained on frames without the indicator bar.
+    """
+
+    def __init__(
+        self,
+        autoencoder: AutoEncoder,
+        mdn_rnn: MDNRNN,
+        parameters: np.ndarray,
+        stride: int = 4,
+        crop_bar: bool = True,
+    ):
+        check_parameters(parameters, parameter_count(autoencoder.latent_size, mdn_rnn.hidden_size))
+        self.autoencoder, self.mdn_rnn, self.parameters = autoencoder, mdn_rnn, parameters
+        self.stride, self.crop_bar = stride, crop_bar
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past: every episode begins with this."""
+        self.memory = FrameMemory(self.stride)
+        self.state: tuple[torch.Tensor, torch.Tensor] | None = None
+        self.latents: np.ndarray | None = None
+        self.hidden: np.ndarray | None = None
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """The action for one car: observation uint8 (96, 96, 3) -> float32 (3,), steering, gas, brake.
+
+        Raises:
+            ValueError: an observation of another shape or dtype, or an action that is not finite.
+        """
+        return self.act_batch([observation])[0]
+
+    @torch.no_grad()
+    def act_batch(self, observations: np.ndarray | list[np.ndarray]) -> np.ndarray:
+        """The actions for cars that drive in step: uint8 (cars, 96, 96, 3) -> float32 (cars, 3).
+
+        Raises:
+            ValueError: as `act`, or another number of cars than in the step before without a `reset`.
+        """
+        frames = np.stack([to_frame(observation, self.crop_bar) for observation in observations])
+        if self.latents is not None and len(frames) != len(self.latents):
+            raise ValueError(
+                f"{len(frames)} observations after {len(self.latents)} in the step before:"
+                " call agent.reset() when an episode begins"
+            )
+        frame, difference = to_pictures(frames, self.memory.push(frames))
+        latents, _ = self.autoencoder.encode(frame, difference)
+        if self.state is None:
+            self.state = tuple(torch.zeros(1, len(frames), self.mdn_rnn.hidden_size) for _ in range(2))
+        self.latents, self.hidden = latents.numpy(), self.state[0][0].numpy()
+        actions = control(self.parameters, np.concatenate([self.latents, self.hidden], axis=1))
+        self.state = self.mdn_rnn.step(latents, torch.from_numpy(actions), self.state)
+        return actions
+
+    def keep(self, cars: np.ndarray) -> None:
+        """Go on with some of the cars only: `cars` are their indices, or a mask, among the present ones."""
+        self.memory.frames = type(self.memory.frames)((f[cars] for f in self.memory.frames), self.stride + 1)
+        self.state = tuple(part[:, cars] for part in self.state)
+        self.latents, self.hidden = self.latents[cars], self.hidden[cars]
+        if self.parameters.ndim == 2:
+            self.parameters = self.parameters[cars]
+
+
+def drive(
+    agent: Agent, tracks: list[int], fast: bool = True, max_frames: int = MAX_FRAMES, patience: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Drive one episode on each track, all cars in step.
+
+    Args:
+        agent: its parameters are one vector, or one row for each track.
+        tracks: seeds of the tracks.
+        fast: draw observations with the fast renderer, or with Gymnasium's own.
+        max_frames: cut an episode after so many frames (CarRacing's own limit is 1,000).
+        patience: end an episode that has reached no new tile for so many frames; 0 for never.
+
+    Returns:
+        The returns, float64 (tracks,), and the lengths in frames, int (tracks,).
+    """
+    envs = [make_env(fast) for _ in tracks]
+    observations = [env.reset(seed=track)[0] for env, track in zip(envs, tracks, strict=True)]
+    returns, lengths = np.zeros(len(tracks)), np.zeros(len(tracks), int)
+    last_tile = np.zeros(len(tracks), int)  # the frame in which a car last reached a new tile
+    driving = list(range(len(tracks)))
+    agent.reset()
+    while driving:
+        going_on = []
+        for place, (car, action) in enumerate(zip(driving, agent.act_batch(observations), strict=True)):
+            observations[place], reward, terminated, truncated, _ = envs[car].step(action)
+            returns[car] += reward
+            lengths[car] += 1
+            if reward > 0:
+                last_tile[car] = lengths[car]
+            lost = patience and lengths[car] - last_tile[car] >= patience
+            if not (terminated or truncated or lost or lengths[car] >= max_frames):
+                going_on.append(place)
+        if len(going_on) < len(driving):
+            driving, observations = [driving[p] for p in going_on], [observations[p] for p in going_on]
+            agent.keep(np.array(going_on, int))
+    for env in envs:
+        env.close()
+    return returns, lengths
+
+
+@functools.lru_cache(maxsize=2)
+def load_world_model(folder: Path, variant: str) -> tuple[AutoEncoder, MDNRNN, int, bool]:
+    """V and M of a run, with stride and crop_bar; kept, so that a worker process reads them once."""
+    autoencoder, facts = load_autoencoder(folder / "autoencoder.safetensors", variant)
+    mdn_rnn, _ = load_mdn_rnn(folder / "mdn_rnn.safetensors", autoencoder.latent_size)
+    return autoencoder, mdn_rnn, facts["stride"], facts["crop_bar"]
+
+
+def load_agent(variant: str, path: str | Path | None = None) -> Agent:
+    """Load a trained agent.
+
+    Args:
+        variant: "frame", "input", "output" or "input_output".
+        path: the folder of a run; None for the one that comes with stad_lab.
+
+    Raises:
+        ValueError: an unknown variant, or files that are damaged or belong to another variant or size.
+        FileNotFoundError: no such run, or the run is not finished.
+    """
+    check_variant(variant)
+    folder = PRETRAINED / variant if path is None else Path(path)
+    if path is None and not (folder / "controller.safetensors").exists():
+        shipped = ", ".join(sorted(file.parent.name for file in PRETRAINED.glob("*/controller.safetensors")))
+        raise FileNotFoundError(
+            f"no trained {variant!r} agent comes with stad_lab, only {shipped}: train one with"
+            f" `python -m stad_lab train --variant {variant} --out runs/{variant}` and give path='runs/{variant}'"
+        )
+    if not folder.is_dir() or not any(folder.iterdir()):
+        raise FileNotFoundError(
+            f"{folder} is {'empty' if folder.is_dir() else 'not a folder'}: expected a run made by"
+            f" `python -m stad_lab train --variant {variant} --out {folder}`"
+        )
+    autoencoder, mdn_rnn, stride, crop_bar = load_world_model.__wrapped__(folder, variant)
+    parameters = load_controller(folder / "controller.safetensors")
+    return Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
+
+
+def save_controller(path: Path, parameters: np.ndarray, **facts) -> None:
+    """Write C's parameters, float64 (parameters,), with facts about where they come from."""
+    save_tensors(path, {"parameters": torch.from_numpy(parameters)}, part="controller", **facts)
+
+
+def load_controller(path: Path) -> np.ndarray:
+    """Read C's parameters, float64 (parameters,).
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: damaged, not C, or not finite.
+    """
+    tensors, facts = load_tensors(path, REMEDY)
+    if facts.get("part") != "controller":
+        raise ValueError(f"{path} holds {facts.get('part')!r}: expected the parameters of a controller")
+    parameters = tensors["parameters"].double().numpy()
+    check_parameters(parameters, parameters.shape[-1], path)
+    return parameters

@@ -1,0 +1,108 @@
+"""Evaluation: an agent on official, unseen tracks. These are the numbers of the table.
+
+Official means Gymnasium's own CarRacing-v3 with its own renderer, whole episodes, on tracks from a range that neither
+training nor validation ever touches. Each track is named by its seed, so anyone can drive it again.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from stad_lab.agent import PRETRAINED, load_agent
+from stad_lab.checkpoints import checksum, save_json
+from stad_lab.evolution import drive_group
+from stad_lab.parallel import make_executor
+from stad_lab.rollouts import TRACK_RANGES
+
+SOLVED = 900  # CarRacing counts as solved at a mean return of 900 over 100 tracks
+GROUP = 4  # cars in step: small groups, because Gymnasium's renderer is slow and a progress bar should move
+
+
+def evaluate(
+    variant: str,
+    path: str | Path | None = None,
+    episodes: int = 100,
+    first_track: int = 0,
+    fast: bool = False,
+    processes: int = 2,
+) -> dict:
+    """Drive an agent on the tracks first_track, first_track + 1, ... and sum up.
+
+    Args:
+        variant: of the agent.
+        path: the folder of a run; None for the agent that comes with stad_lab.
+        episodes: number of tracks, each driven once, to its end.
+        first_track: seed of the first track.
+        fast: draw with the fast renderer instead of Gymnasium's own.
+        processes: worker processes; the numbers do not depend on it.
+
+    Returns:
+        A dict for JSON: "mean", "standard_deviation", "interval" (95%, of the mean), "above_900" (share of episodes),
+        and for every episode its "track", "return" and "frames".
+
+    Raises:
+        ValueError: tracks outside the range that is kept for tests, or an agent that cannot be loaded.
+        FileNotFoundError: no such agent.
+    """
+    low, high = TRACK_RANGES["test"]
+    if episodes < 1 or not low <= first_track <= high - episodes:
+        raise ValueError(
+            f"episodes={episodes} from first_track={first_track}: expected at least 1 episode, on tracks"
+            f" {low} to {high - 1}; those above are for training and validation"
+        )
+    agent = load_agent(variant, path)
+    folder = PRETRAINED / variant if path is None else Path(path)
+    tracks = list(range(first_track, first_track + episodes))
+    groups = [tracks[start : start + GROUP] for start in range(0, episodes, GROUP)]
+    executor = make_executor(processes)
+    try:
+        futures = [executor.submit(drive_group, folder, variant, agent.parameters, g, fast, None) for g in groups]
+        results = []
+        with tqdm(total=episodes, desc=f"evaluate ({variant})", unit="episode") as progress:
+            for future in futures:
+                results.append(future.result())
+                progress.update(len(results[-1][0]))
+    finally:
+        executor.shutdown(cancel_futures=True)
+    returns, frames = (np.concatenate(part) for part in zip(*results, strict=True))
+    return {
+        "variant": variant,
+        "renderer": "fast" if fast else "official",
+        "controller_sha256": checksum(folder / "controller.safetensors"),
+        **summarise(returns),
+        "episodes": [
+            {"track": track, "return": float(value), "frames": int(length)}
+            for track, value, length in zip(tracks, returns, frames, strict=True)
+        ],
+    }
+
+
+def summarise(returns: np.ndarray) -> dict:
+    """Mean, standard deviation, 95% interval of the mean (bootstrap over episodes) and share above 900."""
+    rng = np.random.default_rng(0)
+    means = rng.choice(returns, (10_000, len(returns))).mean(axis=1)
+    return {
+        "mean": float(returns.mean()),
+        "standard_deviation": float(returns.std(ddof=1)) if len(returns) > 1 else 0.0,
+        "interval": [float(bound) for bound in np.percentile(means, [2.5, 97.5])],
+        "above_900": float((returns > SOLVED).mean()),
+    }
+
+
+def describe(result: dict) -> str:
+    """One paragraph of an evaluation, for the screen."""
+    low, high = result["interval"]
+    count = len(result["episodes"])
+    tracks = f"tracks {result['episodes'][0]['track']} to {result['episodes'][-1]['track']}"
+    return (
+        f"{result['variant']}: mean return {result['mean']:.1f} over {count} episodes ({tracks},"
+        f" {result['renderer']} renderer)\n"
+        f"  standard deviation {result['standard_deviation']:.1f}, 95% interval of the mean {low:.1f} to {high:.1f},"
+        f" {100 * result['above_900']:.0f}% of the episodes above {SOLVED}"
+    )
+
+
+def save_evaluation(path: Path, result: dict) -> None:
+    """Write an evaluation as JSON, atomically."""
+    save_json(path, result)

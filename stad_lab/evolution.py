@@ -1,0 +1,193 @@
+"""CMA-ES over C: ask for a population, let it drive in parallel, tell the returns, log, and go on.
+
+The log is the state. CMA-ES is deterministic: its mean, step size, covariance, paths and random state follow from the
+seed and the fitnesses it was told. So a resumed run tells a new strategy every logged generation again (no car drives
+for that, it takes seconds) and then stands exactly where the old one stood. Nothing has to be unpickled.
+"""
+
+import dataclasses
+import zlib
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from pathlib import Path
+
+import cma
+import numpy as np
+from tqdm.auto import tqdm
+
+from stad_lab.agent import Agent, drive, load_world_model, save_controller
+from stad_lab.checkpoints import load_json, save_json
+from stad_lab.controller import initial_parameters
+from stad_lab.parallel import make_executor
+from stad_lab.rollouts import track_seeds
+from stad_lab.settings import Settings, check_same_run
+
+LOG = "evolution.json"
+CONTROLLER = "controller.safetensors"
+
+
+def evolve(variant: str, settings: Settings, folder: Path) -> bool:
+    """Evolve C for the V and M in `folder`; writes `evolution.json` after every generation and the best C found.
+
+    Every agent of a generation drives the same few tracks; its fitness is its mean return. From time to time the mean
+    of the search distribution drives the validation tracks, and the best such mean is kept as `controller.safetensors`:
+    choosing the best *agent* instead would choose the luckiest.
+
+    Returns:
+        False if the run was complete already, True if generations were driven.
+
+    Raises:
+        ValueError: the log in `folder` was made with other settings.
+        KeyboardInterrupt: passed on; the log holds every finished generation.
+    """
+    folder = Path(folder)
+    log = read_log(variant, settings, folder)
+    if len(log["generations"]) >= settings.generations:
+        return False
+    autoencoder, mdn_rnn, *_ = load_world_model(folder, variant)
+    start = initial_parameters(autoencoder.latent_size, mdn_rnn.hidden_size, settings.initial_gas)
+    strategy = replay(start, settings, log["generations"])
+    executor = make_executor(settings.processes)
+    done = len(log["generations"])
+    progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
+    try:
+        for generation in progress:
+            population = np.array(strategy.ask())
+            entry = drive_generation(executor, folder, variant, settings, generation, population)
+            strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
+            entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy)}
+            if (generation + 1) % settings.validate_every == 0 or generation + 1 == settings.generations:
+                validate(executor, folder, variant, settings, strategy.mean, entry, log)
+            log["generations"].append(entry)
+            save_json(folder / LOG, log)
+            worst, average, best = fitness_curves([entry])[:, 0]
+            progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
+    finally:
+        executor.shutdown(cancel_futures=True)
+    return True
+
+
+def read_log(variant: str, settings: Settings, folder: Path) -> dict:
+    """The log of the run in `folder`, or a new one. Raises ValueError if it was made with other settings."""
+    new = {"variant": variant, "settings": settings.as_dict(), "best": None, "generations": []}
+    if not (folder / LOG).exists():
+        return new
+    log = load_json(folder / LOG)
+    check_same_run(folder, {"variant": log["variant"], **log["settings"]}, {"variant": variant, **new["settings"]})
+    return log | {"settings": new["settings"]}
+
+
+def make_strategy(start: np.ndarray, settings: Settings) -> cma.CMAEvolutionStrategy:
+    """pycma's strategy with a random source of its own, so that nothing else can disturb it."""
+    rng = np.random.default_rng([settings.seed, 3])
+    options = {
+        "popsize": settings.population,
+        "randn": lambda *shape: rng.standard_normal(shape),
+        "seed": np.nan,  # "do nothing": leave NumPy's global generator alone
+        "verbose": -9,
+        "verb_log": 0,
+    }
+    return cma.CMAEvolutionStrategy(start, settings.sigma, options)
+
+
+def replay(start: np.ndarray, settings: Settings, generations: list[dict]) -> cma.CMAEvolutionStrategy:
+    """A strategy that has been told all logged generations: the full state of the interrupted run.
+
+    Raises:
+        ValueError: the state is not the logged one, because the log was changed or comes from another machine.
+    """
+    strategy = make_strategy(start, settings)
+    for number, entry in enumerate(generations):
+        population = strategy.ask()
+        strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
+        if mean_checksum(strategy) != entry["mean_checksum"]:
+            raise ValueError(
+                f"replaying the log gives another mean in generation {number + 1} than the run had: the log was"
+                " changed, or made on another machine or by other versions of cma and numpy. Start in a new folder"
+            )
+    return strategy
+
+
+def mean_checksum(strategy: cma.CMAEvolutionStrategy) -> int:
+    """CRC-32 of the mean's bytes: two strategies that agree in it agree to the last bit."""
+    return zlib.crc32(np.ascontiguousarray(strategy.mean).tobytes())
+
+
+def drive_generation(
+    executor: Executor, folder: Path, variant: str, settings: Settings, generation: int, population: np.ndarray
+) -> dict:
+    """Let every agent drive the generation's tracks; returns the log's entry with "returns" [agent][track]."""
+    tracks = track_seeds("evolve", settings.tracks, settings.seed, generation)
+    agents = np.repeat(population, len(tracks), axis=0)
+    returns, lengths = drive_parallel(
+        executor, folder, variant, agents, tracks * len(population), settings.cars, True, settings
+    )
+    shape = (len(population), len(tracks))
+    return {
+        "generation": generation + 1,
+        "tracks": tracks,
+        "returns": returns.reshape(shape).tolist(),
+        "frames": int(lengths.sum()),
+    }
+
+
+def validate(
+    executor: Executor, folder: Path, variant: str, settings: Settings, mean: np.ndarray, entry: dict, log: dict
+) -> None:
+    """Drive the CMA mean on the validation tracks; notes it in `entry`, and keeps it as C if it is the best so far."""
+    tracks = track_seeds("validate", settings.validation_tracks)  # the same ones for every seed
+    means = np.repeat(mean[None], len(tracks), axis=0)
+    limits = dataclasses.replace(settings, patience=0)  # as in the final evaluation: nobody is given up on
+    returns, lengths = drive_parallel(executor, folder, variant, means, tracks, settings.cars, True, limits)
+    entry["validation"] = {"mean": float(returns.mean()), "returns": returns.tolist(), "frames": int(lengths.sum())}
+    if log["best"] is None or returns.mean() > log["best"]["validation"]:
+        log["best"] = {"generation": entry["generation"], "validation": float(returns.mean())}
+        save_controller(folder / CONTROLLER, mean, variant=variant, **log["best"])
+
+
+def drive_parallel(
+    executor: Executor,
+    folder: Path,
+    variant: str,
+    parameters: np.ndarray,
+    tracks: Sequence[int],
+    cars: int,
+    fast: bool,
+    limits: Settings | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Drive one episode for each row of `parameters`, in groups of `cars`: (returns, lengths in frames).
+
+    The groups depend on `cars` alone, so the numbers do not depend on how many processes share the work.
+
+    Args:
+        parameters: (episodes, parameters).
+        tracks: seeds, one for each episode.
+        limits: whose max_frames and patience to apply; None for CarRacing's own rules.
+    """
+    groups = [slice(start, start + cars) for start in range(0, len(tracks), cars)]
+    futures = [
+        executor.submit(drive_group, folder, variant, parameters[group], tracks[group], fast, limits)
+        for group in groups
+    ]
+    results = [future.result() for future in futures]
+    returns, lengths = (np.concatenate(part) for part in zip(*results, strict=True))
+    return returns, lengths
+
+
+def drive_group(
+    folder: Path, variant: str, parameters: np.ndarray, tracks: list[int], fast: bool, limits: Settings | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a worker process does: load V and M once, drive a group of cars in step."""
+    autoencoder, mdn_rnn, stride, crop_bar = load_world_model(folder, variant)
+    agent = Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
+    rules = {"max_frames": limits.max_frames, "patience": limits.patience} if limits else {}
+    return drive(agent, tracks, fast, **rules)
+
+
+def fitness_curves(generations: list[dict]) -> np.ndarray:
+    """Worst, average and best fitness of every generation, (3, generations): the paper's three figures.
+
+    A fitness is an agent's mean return over its tracks.
+    """
+    fitness = [np.mean(entry["returns"], axis=1) for entry in generations]
+    return np.array([[f.min(), f.mean(), f.max()] for f in fitness]).T

@@ -1,0 +1,213 @@
+"""M, the MDN-RNN: an LSTM that predicts the next latent z as a mixture of Gaussians, given z and the action.
+
+The prediction is a distribution, because the road beyond the picture's edge is not known: one Gaussian would answer
+with the average of a left and a right bend, which is a road that does not exist.
+"""
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import nn
+
+from stad_lab.autoencoder import REMEDY, AutoEncoder, load_autoencoder, to_pictures
+from stad_lab.checkpoints import load_into, load_tensors, save_tensors
+from stad_lab.rollouts import Rollouts
+from stad_lab.settings import Settings
+from stad_lab.training import fit
+
+ACTION_SIZE = 3
+LOGSIGMA_RANGE = (-5.0, 3.0)  # a narrower Gaussian would let the likelihood run away on a single latent
+
+State = tuple[torch.Tensor, torch.Tensor]  # h and c of the LSTM, each (1, batch, hidden_size)
+
+
+class Mixture(NamedTuple):
+    """A mixture of Gaussians for every latent dimension; each tensor is (batch, time, latent_size, mixtures)."""
+
+    logpi: torch.Tensor
+    """Logarithms of the weights; their exponentials sum to 1 over the last axis."""
+    mean: torch.Tensor
+    logsigma: torch.Tensor
+
+
+class MDNRNN(nn.Module):
+    """M: latents and actions -> the distribution of the next latents.
+
+    One step and a whole sequence are the same call: a step is a sequence of length one.
+
+    Args:
+        latent_size: dimensions of z.
+        hidden_size: units of the LSTM (World Models: 256).
+        mixtures: Gaussians for each latent dimension (World Models: 5).
+    """
+
+    def __init__(self, latent_size: int = 32, hidden_size: int = 256, mixtures: int = 5):
+        super().__init__()
+        self.latent_size, self.hidden_size, self.mixtures = latent_size, hidden_size, mixtures
+        self.lstm = nn.LSTM(latent_size + ACTION_SIZE, hidden_size, batch_first=True)
+        self.head = nn.Linear(hidden_size, 3 * latent_size * mixtures)
+
+    def forward(
+        self, latents: torch.Tensor, actions: torch.Tensor, state: State | None = None
+    ) -> tuple[Mixture, State]:
+        """Predict z_(t+1) from z_t, a_t and the memory, for every t.
+
+        Args:
+            latents: z, (batch, time, latent_size).
+            actions: (batch, time, 3).
+            state: the memory before the first step; None at an episode's start.
+
+        Returns:
+            The mixture for every step, and the memory after the last.
+        """
+        hidden, state = self.lstm(torch.cat([latents, actions], dim=2), state)
+        return self.mixture(hidden), state
+
+    def step(self, latents: torch.Tensor, actions: torch.Tensor, state: State | None) -> State:
+        """Only remember: one step for a batch of cars, z (batch, latent_size), actions (batch, 3). No prediction."""
+        return self.lstm(torch.cat([latents, actions], dim=1)[:, None], state)[1]
+
+    def mixture(self, hidden: torch.Tensor) -> Mixture:
+        """The head: h (batch, time, hidden_size) -> the mixture it stands for."""
+        batch, time, _ = hidden.shape
+        logits, mean, logsigma = self.head(hidden).view(batch, time, 3, self.latent_size, self.mixtures).unbind(2)
+        return Mixture(logits.log_softmax(-1), mean, logsigma.clamp(*LOGSIGMA_RANGE))
+
+
+def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
+    """Negative log-likelihood of `target` (batch, time, latent_size) in nats for each latent dimension, a scalar.
+
+    -log sum_k pi_k N(target; mean_k, sigma_k), with the sum inside a logsumexp: densities of latents far from every
+    mean underflow to zero, their logarithms do not. It is a density, so the loss can honestly be negative.
+    """
+    error = (target[..., None] - mixture.mean) * torch.exp(-mixture.logsigma)
+    log_density = -0.5 * error**2 - mixture.logsigma - 0.5 * math.log(2 * math.pi)
+    return -torch.logsumexp(mixture.logpi + log_density, dim=-1).mean()
+
+
+def sample_mixture(mixture: Mixture, temperature: float, generator: torch.Generator | None = None) -> torch.Tensor:
+    """Draw z (batch, time, latent_size) from the mixture.
+
+    Args:
+        temperature: above 0. The weights become softmax(logpi / temperature), the deviations sigma * sqrt(temperature),
+            as in World Models: below 1 M dreams of what is likely, above 1 of what is not.
+        generator: the random source; None for torch's own.
+
+    Raises:
+        ValueError: a temperature that is not above 0.
+    """
+    if not temperature > 0:
+        raise ValueError(f"temperature={temperature}: expected a number above 0; 1 is what M has learned")
+    weights = (mixture.logpi / temperature).softmax(-1)
+    flat = weights.reshape(-1, weights.shape[-1])
+    choice = torch.multinomial(flat, 1, generator=generator).view(*weights.shape[:-1], 1)
+    mean, logsigma = mixture.mean.gather(-1, choice)[..., 0], mixture.logsigma.gather(-1, choice)[..., 0]
+    noise = torch.randn(mean.shape, generator=generator)
+    return mean + logsigma.exp() * math.sqrt(temperature) * noise
+
+
+@torch.no_grad()
+def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -> list[np.ndarray]:
+    """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
+    encoded = []
+    for episode in range(len(rollouts.frames)):
+        indices = np.flatnonzero(rollouts.episode == episode)
+        parts = [
+            torch.stack(autoencoder.encode(*to_pictures(*rollouts.pairs(part, stride))))
+            for part in np.array_split(indices, max(1, len(indices) // 250))
+        ]
+        encoded.append(torch.cat(parts, dim=1).numpy())
+    return encoded
+
+
+def sequence_batch(
+    encoded: list[np.ndarray], actions: list[np.ndarray], length: int, batch: int, rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Random stretches of random episodes: z (batch, length + 1, latent_size) and actions (batch, length, 3).
+
+    z is drawn anew from N(mu, exp(logvar)) each time, so that M cannot learn one sample by heart.
+
+    Raises:
+        ValueError: no episode is longer than `length`.
+    """
+    long_enough = [index for index, episode in enumerate(encoded) if episode.shape[1] > length]
+    if not long_enough:
+        longest = max(episode.shape[1] for episode in encoded)
+        raise ValueError(f"m_sequence={length}, but the longest episode has {longest} frames: use shorter sequences")
+    latents, chosen_actions = [], []
+    for index in rng.choice(long_enough, batch):
+        mu, logvar = encoded[index]
+        start = rng.integers(len(mu) - length)
+        stretch = slice(start, start + length + 1)
+        noise = rng.standard_normal((length + 1, mu.shape[1]), np.float32)
+        latents.append(mu[stretch] + np.exp(0.5 * logvar[stretch]) * noise)
+        chosen_actions.append(actions[index][start : start + length])
+    return torch.from_numpy(np.stack(latents)), torch.from_numpy(np.stack(chosen_actions))
+
+
+def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folder: Path) -> bool:
+    """Train M on what V, in `folder`, makes of the rollouts, and write `mdn_rnn.safetensors` beside it.
+
+    Resumes, and returns False if it was done already.
+    """
+    path = Path(folder) / "mdn_rnn.safetensors"
+    if path.exists():
+        load_mdn_rnn(path)
+        return False
+    autoencoder, _ = load_autoencoder(path.with_name("autoencoder.safetensors"), variant)
+    rollouts = Rollouts(rollouts_folder)
+    torch.manual_seed(settings.seed)
+    mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
+    encoded = encode_rollouts(autoencoder, rollouts, settings.stride)
+    first_heldout = rollouts.episode[rollouts.split()[1][0]]
+
+    def losses_on(episodes: slice, batch: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
+        latents, actions = sequence_batch(
+            encoded[episodes], rollouts.actions[episodes], settings.m_sequence, batch, rng
+        )
+        mixture, _ = mdn_rnn(latents[:, :-1], actions)
+        return {"total": mdn_loss(mixture, latents[:, 1:])}
+
+    def batch_losses(step: int) -> dict[str, torch.Tensor]:
+        rng = np.random.default_rng([settings.seed, 2, step])
+        return losses_on(slice(first_heldout), settings.m_batch, rng)
+
+    @torch.no_grad()
+    def heldout_losses() -> dict[str, float]:
+        return {"total": losses_on(slice(first_heldout, None), 64, np.random.default_rng(0))["total"].item()}
+
+    checkpoint = path.with_name("mdn_rnn.training.safetensors")
+    history = fit(
+        mdn_rnn, batch_losses, heldout_losses, settings.m_steps, settings.m_learning_rate, checkpoint, "train M"
+    )
+    save_mdn_rnn(path, mdn_rnn, history)
+    checkpoint.unlink()
+    return True
+
+
+def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, history: list) -> None:
+    """Write M's weights with what is needed to build it again."""
+    sizes = {name: getattr(mdn_rnn, name) for name in ("latent_size", "hidden_size", "mixtures")}
+    save_tensors(path, mdn_rnn.state_dict(), part="mdn_rnn", **sizes, history=history)
+
+
+def load_mdn_rnn(path: Path, latent_size: int | None = None) -> tuple[MDNRNN, dict]:
+    """Read M: (the MDN-RNN in evaluation mode, the facts it was saved with, among them its history).
+
+    Raises:
+        FileNotFoundError: no such file.
+        ValueError: damaged, not M, or for another latent size than `latent_size`.
+    """
+    tensors, facts = load_tensors(path, REMEDY)
+    if facts.get("part") != "mdn_rnn":
+        raise ValueError(f"{path} holds {facts.get('part')!r}: expected the weights of an mdn_rnn")
+    if latent_size not in (None, facts["latent_size"]):
+        raise ValueError(
+            f"{path} was trained for latent_size {facts['latent_size']}, V has {latent_size}: use M and V of one run"
+        )
+    mdn_rnn = MDNRNN(facts["latent_size"], facts["hidden_size"], facts["mixtures"])
+    load_into(mdn_rnn, tensors, path)
+    return mdn_rnn.eval().requires_grad_(False), facts

@@ -1,0 +1,163 @@
+"""From an empty folder to a trained agent: the four stages in order, each resumable, and the record of the run.
+
+rollouts/                     the random driver's episodes
+autoencoder.safetensors       V
+mdn_rnn.safetensors           M
+evolution.json                every generation of CMA-ES
+controller.safetensors        C: the CMA mean that drove the validation tracks best
+record.json                   variant, settings, versions, commit, and the time and budget of every stage
+"""
+
+import importlib.metadata
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from stad_lab.agent import PRETRAINED
+from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoencoder
+from stad_lab.checkpoints import load_json, load_tensors, save_json, save_tensors
+from stad_lab.evolution import LOG, evolve
+from stad_lab.mdn_rnn import train_mdn_rnn
+from stad_lab.rollouts import collect_rollouts
+from stad_lab.settings import Settings, check_same_run
+
+STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
+PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
+WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", "controller.safetensors")
+
+
+def train(
+    variant: str,
+    settings: Settings,
+    folder: str | Path,
+    rollouts_folder: str | Path | None = None,
+    until: str = "controller",
+) -> bool:
+    """Run every stage up to `until` that is not finished in `folder`; run it again after an interrupt to go on.
+
+    Args:
+        variant: "frame", "input", "output" or "input_output".
+        folder: of the run; made if missing.
+        rollouts_folder: where the rollouts are, or go; None for `folder/rollouts`. Runs may share one.
+        until: the last stage to run.
+
+    Returns:
+        False if everything was finished already and nothing was done.
+
+    Raises:
+        ValueError: an unknown variant or stage, or a folder with a run of another variant or other settings.
+    """
+    check_variant(variant)
+    if until not in STAGES:
+        raise ValueError(f"unknown stage {until!r}: choose one of {', '.join(STAGES)}")
+    folder = Path(folder)
+    rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
+    record = open_record(folder, variant, settings)
+    save_json(folder / "record.json", record)
+    stages = {
+        "rollouts": lambda: collect_rollouts(settings, rollouts_folder),
+        "autoencoder": lambda: train_autoencoder(variant, settings, rollouts_folder, folder),
+        "mdn_rnn": lambda: train_mdn_rnn(variant, settings, rollouts_folder, folder),
+        "controller": lambda: evolve(variant, settings, folder),
+    }
+    worked = False
+    for stage in STAGES[: STAGES.index(until) + 1]:
+        begin, did = time.perf_counter(), True  # an interrupted stage has worked too
+        try:
+            did = stages[stage]()
+        finally:
+            if did:
+                record["seconds"][stage] = record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
+                save_json(folder / "record.json", record)
+        print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
+        worked |= did
+    if worked:
+        record["budget"] = budget(folder, rollouts_folder)
+        save_json(folder / "record.json", record)
+    return worked
+
+
+def open_record(folder: Path, variant: str, settings: Settings) -> dict:
+    """The record of the run in `folder`, or a new one.
+
+    Raises:
+        ValueError: the folder holds a run of another variant or of other settings.
+    """
+    path = folder / "record.json"
+    if not path.exists():
+        return {"variant": variant, "settings": settings.as_dict(), "made_with": provenance(), "seconds": {}}
+    record = load_json(path)
+    check_same_run(
+        folder, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
+    )
+    return record | {"settings": settings.as_dict()}
+
+
+def provenance() -> dict:
+    """What the run was made with: versions, machine, and the commit if the code lies in a git checkout."""
+    return {
+        "python": platform.python_version(),
+        **{package: importlib.metadata.version(package) for package in PACKAGES},
+        "platform": platform.platform(),
+        "cores": os.cpu_count(),
+        "commit": git("rev-parse", "HEAD"),
+        "uncommitted_changes": bool(git("status", "--porcelain", "--", str(Path(__file__).parent))),
+        "command": " ".join(["python -m stad_lab", *sys.argv[1:]]),
+    }
+
+
+def git(*arguments: str) -> str | None:
+    """What git says about this checkout; None without git or outside a checkout."""
+    try:
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def budget(folder: Path, rollouts_folder: Path) -> dict:
+    """Every episode and frame ever driven for this run, by what it was driven for."""
+    blocks = load_json(rollouts_folder / "manifest.json")["blocks"]
+    spent = {"random": {"episodes": len(blocks), "frames": sum(block["frames"] for block in blocks)}}
+    if (folder / LOG).exists():
+        log = load_json(folder / LOG)["generations"]
+        looks = [entry["validation"] for entry in log if "validation" in entry]
+        spent["agents"] = sum(len(entry["returns"]) for entry in log)
+        spent["evolution"] = {
+            "episodes": sum(len(returns) for entry in log for returns in entry["returns"]),
+            "frames": sum(entry["frames"] for entry in log),
+        }
+        spent["validation"] = {
+            "episodes": sum(len(look["returns"]) for look in looks),
+            "frames": sum(look["frames"] for look in looks),
+        }
+    return spent
+
+
+def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
+    """Copy what a run has trained into `stad_lab/pretrained/`: records as they are, V and M in half precision.
+
+    Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run.
+
+    Raises:
+        FileNotFoundError: the run has no V.
+        ValueError: the run is damaged, or of another variant.
+    """
+    folder, target = Path(folder), target / variant
+    load_autoencoder(folder / WEIGHTS[0], variant)
+    target.mkdir(parents=True, exist_ok=True)
+    for name in WEIGHTS:
+        if (folder / name).exists():
+            tensors, facts = load_tensors(folder / name)
+            small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
+            save_tensors(target / name, small, **facts)
+    for name in ("record.json", LOG):
+        if (folder / name).exists():
+            shutil.copyfile(folder / name, target / name)
+    return target

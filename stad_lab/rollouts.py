@@ -1,0 +1,195 @@
+"""Rollouts: a random driver collects episodes, in parallel, into a dataset on disk.
+
+A folder of rollouts holds one block for each episode, `00042.frames.npy` (uint8) and `00042.actions.npy` (float32), and
+`manifest.json` with the settings, and for each block its track, length and checksums. A block enters the manifest only
+when it is complete on disk, so an interrupted collection goes on where it stopped. Blocks are read memory-mapped: a
+dataset may be larger than the memory.
+"""
+
+import io
+from concurrent.futures import as_completed
+from pathlib import Path
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from stad_lab.car_racing import make_env, place_car
+from stad_lab.checkpoints import checksum, load_json, save_json, write_bytes
+from stad_lab.frames import FRAME_SIZE, earlier_index, to_frame
+from stad_lab.parallel import make_executor
+from stad_lab.settings import Settings
+
+# Tracks are named by the seed of `env.reset`. The four uses never share one: an agent is reported on tracks that nothing
+# was trained or chosen on.
+TRACK_RANGES = {
+    "test": (0, 1_000_000),
+    "collect": (1_000_000, 2_000_000),
+    "evolve": (2_000_000, 3_000_000),
+    "validate": (3_000_000, 4_000_000),
+}
+COLLECT_FIELDS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
+
+
+def track_seeds(use: str, count: int, *seed: int) -> list[int]:
+    """Seeds of `count` tracks for one use, drawn from that use's own range with the random seed `seed`."""
+    low, high = TRACK_RANGES[use]
+    return np.random.default_rng([list(TRACK_RANGES).index(use), *seed]).integers(low, high, count).tolist()
+
+
+class RandomDriver:
+    """Drives without looking: smooth random steering that returns to the middle, gentle gas, a rare brake.
+
+    Steering is a mean-reverting random walk (an Ornstein-Uhlenbeck process); gas wanders around 0.35.
+    """
+
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
+        self.steering, self.gas, self.brake_frames = 0.0, 0.35, 0
+
+    def act(self) -> np.ndarray:
+        """The next action, float32 (3,): steering in [-1, 1], gas and brake in [0, 1]."""
+        self.steering += -0.1 * self.steering + 0.2 * self.rng.standard_normal()
+        self.gas += 0.05 * (0.35 - self.gas) + 0.08 * self.rng.standard_normal()
+        self.brake_frames = max(0, self.brake_frames - 1)
+        if self.rng.random() < 0.01:
+            self.brake_frames = int(self.rng.integers(5, 20))
+        brake = 0.4 if self.brake_frames else 0.0
+        action = [np.clip(self.steering, -1, 1), np.clip(self.gas, 0, 1) * (not brake), brake]
+        return np.array(action, np.float32)
+
+
+def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Drive episode number `index`: (frames uint8 (T, 64, 64, 3), actions float32 (T, 3), track seed).
+
+    `actions[t]` is what the driver does on seeing `frames[t]`. Most episodes start moving on a random tile, or the data
+    would be nothing but the first bend and then grass.
+    """
+    track = track_seeds("collect", settings.episodes, settings.seed)[index]
+    rng = np.random.default_rng([settings.seed, index])
+    env = make_env(fast=True)
+    observation, _ = env.reset(seed=track)
+    if rng.random() < settings.random_starts:
+        observation = place_car(
+            env,
+            tile=int(rng.integers(10_000)),
+            speed=rng.uniform(0, 70),
+            turn=0.15 * rng.standard_normal(),
+            offset=rng.uniform(-0.7, 0.7),
+        )
+    driver, frames, actions = RandomDriver(rng), [], []
+    for _ in range(settings.episode_frames):
+        frames.append(to_frame(observation, settings.crop_bar))
+        actions.append(driver.act())
+        observation, _, terminated, truncated, _ = env.step(actions[-1])
+        if terminated or truncated:
+            break
+    env.close()
+    return np.array(frames), np.array(actions), track
+
+
+def collect_block(settings: Settings, index: int, folder: Path) -> dict:
+    """Drive one episode and write its block; returns the block's entry for the manifest. Runs in a worker process."""
+    frames, actions, track = drive_randomly(settings, index)
+    entry = {"index": index, "track": track, "frames": len(frames)}
+    for name, array in (("frames", frames), ("actions", actions)):
+        path = block_path(folder, index, name)
+        buffer = io.BytesIO()
+        np.save(buffer, array, allow_pickle=False)
+        write_bytes(path, buffer.getbuffer())
+        entry[f"{name}_sha256"] = checksum(path)
+    return entry
+
+
+def block_path(folder: Path, index: int, name: str) -> Path:
+    """Where the array `name` ("frames" or "actions") of block `index` lies."""
+    return folder / f"{index:05d}.{name}.npy"
+
+
+def collect_rollouts(settings: Settings, folder: Path) -> bool:
+    """Collect the random driver's episodes into `folder`; goes on where an earlier call stopped.
+
+    Returns:
+        False if everything was there already, True if something was collected.
+
+    Raises:
+        ValueError: the folder holds rollouts of other settings.
+    """
+    folder = Path(folder)
+    wanted = {field: getattr(settings, field) for field in COLLECT_FIELDS}
+    manifest_path = folder / "manifest.json"
+    manifest = load_json(manifest_path) if manifest_path.exists() else {"settings": wanted, "blocks": []}
+    if manifest["settings"] != wanted:
+        raise ValueError(
+            f"{folder} holds rollouts collected with {manifest['settings']}, and now {wanted} is asked for:"
+            " choose another folder or the same settings"
+        )
+    done = {entry["index"] for entry in manifest["blocks"]}
+    missing = [index for index in range(settings.episodes) if index not in done]
+    if not missing:
+        return False
+    folder.mkdir(parents=True, exist_ok=True)
+    save_json(manifest_path, manifest)
+    executor = make_executor(settings.processes)
+    try:
+        futures = [executor.submit(collect_block, settings, index, folder) for index in missing]
+        progress = tqdm(as_completed(futures), "collect", settings.episodes, initial=len(done), unit="episode")
+        for future in progress:
+            manifest["blocks"] = sorted([*manifest["blocks"], future.result()], key=lambda entry: entry["index"])
+            save_json(manifest_path, manifest)
+    finally:
+        executor.shutdown(cancel_futures=True)
+    return True
+
+
+class Rollouts:
+    """The dataset in a folder, read-only and memory-mapped.
+
+    Attributes:
+        frames: one uint8 array (T, 64, 64, 3) for each episode.
+        actions: one float32 array (T, 3) for each episode.
+
+    Raises:
+        FileNotFoundError: no manifest, or a block is missing.
+        ValueError: a block is damaged: its size or checksum is not the manifest's.
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = Path(folder)
+        remedy = f"collect the rollouts first: python -m stad_lab train ... --rollouts {self.folder}"
+        self.manifest = load_json(self.folder / "manifest.json", remedy)
+        self.frames, self.actions = [], []
+        for entry in self.manifest["blocks"]:
+            self.frames.append(self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8))
+            self.actions.append(self._read(entry, "actions", (entry["frames"], 3), np.float32))
+        lengths = [len(frames) for frames in self.frames]
+        self.episode = np.repeat(np.arange(len(lengths)), lengths)  # of every frame in the dataset
+        self.moment = np.concatenate([np.arange(length) for length in lengths])  # its index in that episode
+
+    def _read(self, entry: dict, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
+        path = block_path(self.folder, entry["index"], name)
+        remedy = f"delete {self.folder} and collect again"
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} is missing although the manifest lists it: {remedy}")
+        if checksum(path) != entry[f"{name}_sha256"]:
+            raise ValueError(
+                f"{path} is damaged ({path.stat().st_size} bytes, and not the checksum in the manifest): {remedy}"
+            )
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        if array.shape != shape or array.dtype != dtype:
+            raise ValueError(f"{path} holds {array.dtype} {array.shape}, the manifest says {shape}: {remedy}")
+        return np.asarray(array)  # a plain view on the map: much faster to index than numpy.memmap
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+    def pairs(self, indices: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
+        """Frames and the frames to subtract from them, for indices into the whole dataset: two uint8 (n, 64, 64, 3)."""
+        episodes, moments = self.episode[indices], self.moment[indices]
+        frames = np.stack([self.frames[e][t] for e, t in zip(episodes, moments, strict=True)])
+        before = earlier_index(moments, stride)
+        return frames, np.stack([self.frames[e][t] for e, t in zip(episodes, before, strict=True)])
+
+    def split(self, heldout: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of training frames and of held-out frames: whole episodes, the last ones, at least one."""
+        first = len(self.frames) - max(1, round(heldout * len(self.frames)))
+        return np.flatnonzero(self.episode < first), np.flatnonzero(self.episode >= first)

@@ -1,0 +1,222 @@
+"""The settings: one frozen dataclass with three presets, `quick`, `laptop` and `paper`.
+
+Every number that shapes a run is here, with its unit; nothing else is configured anywhere. A run's settings are written
+into its folder, so a result can always be traced back to them.
+"""
+
+import dataclasses
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+ENVIRONMENT_VARIABLE = "STAD_LAB_SETTINGS"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that shapes a run. Defaults are the `laptop` preset.
+
+    Raises:
+        ValueError: a value of the wrong type or out of its range, with the name, the value and what was expected.
+    """
+
+    name: str = "laptop"
+    """Name of the preset these settings began as."""
+    seed: int = 0
+    """Seed of the whole run: data, weights, tracks and mutations follow from it."""
+    processes: int = 2
+    """Worker processes that drive cars. The results do not depend on it."""
+
+    # Frames and differences (paper, sections 3.1 and 4)
+    crop_bar: bool = True
+    """Cut the indicator bar (lowest 12 of 96 rows) off before shrinking, as World Models does."""
+    stride: int = 4
+    """k of the difference image d_t = x_t - x_(t-k), in frames."""
+
+    # Rollouts of the random driver
+    episodes: int = 400
+    """Episodes to collect."""
+    episode_frames: int = 250
+    """Frames of an episode, at most."""
+    random_starts: float = 0.9
+    """Share of the episodes that start moving, on a random tile, instead of at rest on tile 0."""
+
+    # V, the auto encoder
+    latent_size: int = 32
+    """Dimensions of z."""
+    width: int = 16
+    """Channels of V's first convolution; the others follow from it. World Models has 32."""
+    kl_weight: float = 0.25
+    """Weight of the KL term against the squared errors. World Models has 1."""
+    free_bits: float = 0.0
+    """KL below this many nats for each latent dimension costs nothing. World Models has 0.5."""
+    difference_weight: float = 1.0
+    """Weight of the difference image's squared error, in the variants that redraw it."""
+    v_steps: int = 5000
+    """Training steps of V."""
+    v_batch: int = 128
+    """Frames in a batch."""
+    v_learning_rate: float = 1e-3
+    """Adam's rate at the start; it falls to a tenth along a cosine."""
+
+    # M, the MDN-RNN
+    hidden_size: int = 256
+    """Units of the LSTM."""
+    mixtures: int = 5
+    """Gaussians in the mixture of each latent dimension."""
+    m_steps: int = 1500
+    """Training steps of M."""
+    m_batch: int = 64
+    """Sequences in a batch."""
+    m_sequence: int = 96
+    """Frames in a sequence."""
+    m_learning_rate: float = 2e-3
+    """Adam's rate at the start; it falls to a tenth along a cosine."""
+
+    # C, evolved by CMA-ES
+    generations: int = 70
+    """Generations of CMA-ES."""
+    population: int = 16
+    """Agents in a generation."""
+    tracks: int = 4
+    """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
+    sigma: float = 0.1
+    """CMA-ES's first step size."""
+    initial_gas: float = -0.5
+    """Gas output of the first controller before squashing: (tanh(-0.5) + 1) / 2 is 27% gas."""
+    patience: int = 100
+    """In training, an episode that reaches no new tile for this many frames is ended; 0 for never."""
+    max_frames: int = 1000
+    """Frames of a training episode, at most; CarRacing's own limit is 1,000."""
+    cars: int = 16
+    """Cars that one process drives in step, with one batch through V and M."""
+    validate_every: int = 10
+    """Generations between two looks at the CMA mean on the validation tracks."""
+    validation_tracks: int = 16
+    """Tracks of such a look."""
+
+    def __post_init__(self):
+        for field in dataclasses.fields(self):
+            check_value(field.name, field.type, getattr(self, field.name))
+        if self.episode_frames <= self.stride:
+            raise ValueError(
+                f"episode_frames={self.episode_frames}, but with stride={self.stride} the first difference image"
+                f" exists only after {self.stride} frames: use more than {self.stride} frames"
+            )
+        if self.m_sequence >= self.episode_frames:
+            raise ValueError(
+                f"m_sequence={self.m_sequence} does not fit into episodes of episode_frames={self.episode_frames}:"
+                f" use at most {self.episode_frames - 1}"
+            )
+
+    @staticmethod
+    def preset(name: str | None = None, **changes) -> "Settings":
+        """Look up a preset by name.
+
+        Args:
+            name: "quick", "laptop" or "paper"; None reads the environment variable STAD_LAB_SETTINGS, and takes
+                "laptop" if that is not set.
+            **changes: fields to set differently, for example `stride=2`.
+
+        Raises:
+            ValueError: an unknown preset, an unknown field, or a value out of range.
+        """
+        name = name or os.environ.get(ENVIRONMENT_VARIABLE) or "laptop"
+        if name not in PRESETS:
+            raise ValueError(f"unknown settings {name!r}: choose one of {', '.join(PRESETS)}")
+        return dataclasses.replace(PRESETS[name], **known_fields(changes))
+
+    def as_dict(self) -> dict:
+        """All fields as a plain dict, for JSON."""
+        return dataclasses.asdict(self)
+
+    @staticmethod
+    def from_dict(values: dict) -> "Settings":
+        """The inverse of `as_dict`. Raises ValueError for unknown fields or values out of range."""
+        return Settings(**known_fields(values))
+
+
+ZERO_ALLOWED = ("seed", "patience", "random_starts", "kl_weight", "free_bits", "difference_weight")
+AT_LEAST = {"population": 4, "m_sequence": 2}
+
+
+def check_value(name: str, kind: type, value) -> None:
+    """Raise ValueError unless `value` is a sensible value of the field `name`."""
+    if kind is float and type(value) is int:
+        value = float(value)
+    if type(value) is not kind:
+        raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
+    if kind in (int, float) and name != "initial_gas":
+        lowest = AT_LEAST.get(name, 0 if name in ZERO_ALLOWED else 1 if kind is int else 1e-12)
+        highest = 1.0 if name == "random_starts" else 1e12
+        if not lowest <= value <= highest:
+            raise ValueError(f"{name}={value!r} is out of range: expected {lowest:g} to {highest:g}")
+
+
+def known_fields(values: dict) -> dict:
+    """Return `values` unchanged, or raise ValueError if one of its keys is not a field of Settings."""
+    fields = [field.name for field in dataclasses.fields(Settings)]
+    for name in values:
+        if name not in fields:
+            raise ValueError(f"unknown setting {name!r}: the settings are {', '.join(fields)}")
+    return values
+
+
+MAY_CHANGE = ("name", "processes", "generations")  # between a run and its continuation
+
+
+def check_same_run(folder: Path, was: dict, now: dict) -> None:
+    """Raise ValueError if `folder` holds a run whose variant or settings differ from those asked for now."""
+    for name in now:
+        if name not in MAY_CHANGE and was.get(name) != now[name]:
+            raise ValueError(
+                f"{folder} holds a run with {name}={was.get(name)!r}, and now {name}={now[name]!r} is asked for:"
+                " choose another folder, or the same variant and settings"
+            )
+
+
+PRESETS = {
+    # The whole pipeline in under a minute: shows that everything works, teaches the car nothing.
+    "quick": Settings(
+        name="quick",
+        episodes=8,
+        episode_frames=60,
+        width=8,
+        v_steps=40,
+        v_batch=32,
+        hidden_size=32,
+        m_steps=20,
+        m_batch=8,
+        m_sequence=24,
+        generations=3,
+        population=4,
+        tracks=1,
+        max_frames=60,
+        cars=4,
+        validate_every=2,
+        validation_tracks=2,
+    ),
+    # A car that drives, in about half an hour on two cores.
+    "laptop": Settings(),
+    # The budget that the paper states, with World Models' sizes and loss; what it leaves open is our reading.
+    "paper": Settings(
+        name="paper",
+        episodes=1000,
+        episode_frames=1000,
+        random_starts=0.0,
+        width=32,
+        kl_weight=1.0,
+        free_bits=0.5,
+        v_steps=80000,
+        v_learning_rate=1e-4,
+        m_steps=20000,
+        m_batch=100,
+        m_sequence=500,
+        m_learning_rate=1e-3,
+        generations=600,
+        population=8,
+        tracks=1,
+        initial_gas=0.0,
+        patience=0,
+    ),
+}

@@ -1,0 +1,103 @@
+"""One training loop for V and for M: Adam, a falling learning rate, a history, and a resume that changes nothing.
+
+What happens in step s depends on (seed, s) and the weights alone: the caller draws step s's batch and noise from a
+Generator seeded with both. So a run that was interrupted and resumed makes the same updates as one that was not.
+"""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from tqdm.auto import tqdm
+
+from stad_lab.checkpoints import load_into, load_tensors, save_tensors
+
+RECORDS = 20  # entries of the history, and checkpoints, in a run
+
+
+def fit(
+    model: torch.nn.Module,
+    batch_losses: Callable[[int], dict[str, torch.Tensor]],
+    heldout_losses: Callable[[], dict[str, float]],
+    steps: int,
+    learning_rate: float,
+    checkpoint: Path,
+    label: str,
+) -> list[dict]:
+    """Train `model` in place for `steps` steps, or for those left after the checkpoint.
+
+    Args:
+        batch_losses: step -> named losses of that step's batch; "total" is minimised.
+        heldout_losses: named losses on held-out data, computed without gradients.
+        learning_rate: Adam's rate at the start; it falls to a tenth of it along a cosine.
+        checkpoint: file of the training state, read if it exists, written 20 times a run and on interrupt.
+        label: what the progress bar says.
+
+    Returns:
+        The history: 20 entries {"step", "train": means since the last entry, "heldout"}.
+
+    Raises:
+        ValueError: the checkpoint belongs to another model or is damaged.
+        FloatingPointError: the loss is not finite.
+    """
+    optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    start, sums, history = 0, {}, []
+    if checkpoint.exists():
+        start, sums, history = load_state(checkpoint, model, optimizer)
+    every = max(1, steps // RECORDS)
+    step = start
+    try:
+        progress = tqdm(range(start, steps), label, steps, initial=start, unit="step")
+        for step in progress:
+            for group in optimizer.param_groups:
+                group["lr"] = learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps))
+            losses = batch_losses(step)
+            if not torch.isfinite(losses["total"]):
+                raise FloatingPointError(
+                    f"{label}: the loss is {losses['total'].item()} in step {step}: lower the learning rate"
+                )
+            optimizer.zero_grad(set_to_none=True)
+            losses["total"].backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 100.0)
+            optimizer.step()
+            for name, loss in losses.items():
+                sums[name] = sums.get(name, 0.0) + loss.item()
+            if (step + 1) % every == 0:
+                history.append(
+                    {
+                        "step": step + 1,
+                        "train": {name: total / every for name, total in sums.items()},
+                        "heldout": heldout_losses(),
+                    }
+                )
+                sums = {}
+                progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
+                save_state(checkpoint, model, optimizer, step + 1, sums, history)
+    except KeyboardInterrupt:
+        # The interrupt may have come in mid-update; the checkpoint of the last record is whole, so it stays.
+        print(f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint")
+        raise
+    return history
+
+
+def save_state(path: Path, model, optimizer, step: int, sums: dict, history: list) -> None:
+    """Write everything the next step depends on: weights, Adam's moments, and where we are."""
+    tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
+    for number, moments in optimizer.state_dict()["state"].items():
+        tensors |= {f"adam.{number}.{name}": tensor for name, tensor in moments.items()}
+    save_tensors(path, tensors, step=step, sums=sums, history=history)
+
+
+def load_state(path: Path, model, optimizer) -> tuple[int, dict, list]:
+    """Restore what `save_state` wrote into `model` and `optimizer`; returns (step, sums, history)."""
+    tensors, facts = load_tensors(path, "run the same command again, from the start")
+    weights = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith("model.")}
+    load_into(model, weights, path)
+    state = optimizer.state_dict()
+    for name, tensor in tensors.items():
+        if name.startswith("adam."):
+            _, number, moment = name.split(".")
+            state["state"].setdefault(int(number), {})[moment] = tensor
+    optimizer.load_state_dict(state)
+    return facts["step"], facts["sums"], facts["history"]
