@@ -19,8 +19,8 @@ from stad_lab.frames import FRAME_SIZE, earlier_index, to_frame
 from stad_lab.parallel import make_executor
 from stad_lab.settings import Settings
 
-# Tracks are named by the seed of `env.reset`. The four uses never share one: an agent is reported on tracks that nothing
-# was trained or chosen on.
+# Tracks are named by the seed of `env.reset`. The four uses never share one: an agent is reported on tracks that
+# nothing was trained or chosen on.
 TRACK_RANGES = {
     "test": (0, 1_000_000),
     "collect": (1_000_000, 2_000_000),
@@ -72,7 +72,7 @@ def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarr
         observation = place_car(
             env,
             tile=int(rng.integers(10_000)),
-            speed=rng.uniform(0, 70),
+            speed=rng.uniform(0, 90),
             turn=0.15 * rng.standard_normal(),
             offset=rng.uniform(-0.7, 0.7),
         )

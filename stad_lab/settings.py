@@ -34,10 +34,10 @@ class Settings:
     """k of the difference image d_t = x_t - x_(t-k), in frames."""
 
     # Rollouts of the random driver
-    episodes: int = 400
+    episodes: int = 900
     """Episodes to collect."""
-    episode_frames: int = 250
-    """Frames of an episode, at most."""
+    episode_frames: int = 120
+    """Frames of an episode, at most. A random driver is soon off the road: short episodes see more of it."""
     random_starts: float = 0.9
     """Share of the episodes that start moving, on a random tile, instead of at rest on tile 0."""
 
@@ -68,7 +68,7 @@ class Settings:
     """Training steps of M."""
     m_batch: int = 64
     """Sequences in a batch."""
-    m_sequence: int = 96
+    m_sequence: int = 100
     """Frames in a sequence."""
     m_learning_rate: float = 2e-3
     """Adam's rate at the start; it falls to a tenth along a cosine."""
