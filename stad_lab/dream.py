@@ -121,7 +121,7 @@ def to_uint8(frames: torch.Tensor) -> np.ndarray:
 def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Let an agent that has just acted in the real environment go on driving with its eyes closed.
 
-    The dream begins with what M, after the agent's last action, expects to see next; from there on C sees what M dreams.
+    The dream begins with what M, after the agent's last action, expects to see next; from there on C sees the dream.
     The agent itself is not changed. For an agent that drives one car.
 
     Returns:
