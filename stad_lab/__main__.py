@@ -1,4 +1,4 @@
-"""The command line: python -m stad_lab train | evaluate | ship."""
+"""The command line: python -m stad_lab train | evaluate | film | ship."""
 
 import argparse
 import dataclasses
@@ -6,8 +6,11 @@ import json
 import sys
 from pathlib import Path
 
+from stad_lab.agent import load_agent
 from stad_lab.autoencoder import VARIANTS
+from stad_lab.checkpoints import write_bytes
 from stad_lab.evaluation import describe, evaluate, save_evaluation
+from stad_lab.film import film_agent
 from stad_lab.pipeline import PRETRAINED, STAGES, ship, train
 from stad_lab.settings import PRESETS, Settings
 
@@ -66,6 +69,18 @@ def build_parser() -> argparse.ArgumentParser:
         "ship", parents=[variant], help="copy a run's weights and records to stad_lab/pretrained"
     )
     command.add_argument("--path", type=Path, required=True, help="folder of the run")
+
+    command = commands.add_parser(
+        "film",
+        parents=[variant],
+        help="make a moving picture of an agent driving",
+        description="Observation, difference image and reconstruction side by side, as an animated GIF.",
+    )
+    command.add_argument("--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab")
+    command.add_argument("--out", type=Path, required=True, help="the GIF to write")
+    command.add_argument("--track", type=int, default=5, help="seed of the track, default 5")
+    command.add_argument("--first", type=int, default=60, help="first frame shown, default 60: after the opening zoom")
+    command.add_argument("--frames", type=int, default=240, help="frames covered, default 240; every third is shown")
     return parser
 
 
@@ -102,6 +117,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"  every episode: {file}")
         elif options.command == "ship":
             print(f"shipped to {ship(options.variant, options.path)}")
+        elif options.command == "film":
+            agent = load_agent(options.variant, options.path)
+            write_bytes(options.out, film_agent(agent, options.track, options.first, options.frames))
+            print(f"filmed to {options.out}")
     except (ValueError, FileNotFoundError, FloatingPointError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -51,6 +51,7 @@ WHEEL_POLYGON = (
     np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)]) * (car_dynamics.WHEEL_W, car_dynamics.WHEEL_R) * car_dynamics.SIZE
 )
 HULL_COLOR = (204, 0, 0)
+NOWHERE = np.full((4, 2), 1e4)  # world units from the car: never in the picture
 
 
 def make_env(fast: bool = True, **kwargs) -> gym.Env:
@@ -80,6 +81,11 @@ class FastCarRacing(reference.CarRacing):
         self._ground = None
         return super().reset(seed=seed, options=options)
 
+    def close(self):
+        """As Gymnasium's close, and lets go of the texture (20 MB), which reference cycles would keep for long."""
+        super().close()
+        self._ground = None
+
     def _render(self, mode: str):
         if mode != "state_pixels":
             return super()._render(mode)
@@ -90,11 +96,10 @@ class FastCarRacing(reference.CarRacing):
         # The first second zooms in from the whole field to the car, as in Gymnasium.
         zoom = 0.1 * reference.SCALE * max(1 - self.t, 0) + reference.ZOOM * reference.SCALE * min(self.t, 1)
         picture = self._ground.look(self.car.hull.position, angle, zoom)
-        draw_car(picture, self.car, angle, zoom)
-        observation = cv2.resize(picture, (OBSERVATION_SIZE, OBSERVATION_SIZE), interpolation=cv2.INTER_AREA)
-        observation = cv2.subtract(observation, (DARKENING,) * 4)
-        observation[BAR_TOP:] = indicator_bar(self.car, self.reward)
-        return observation
+        draw_car(picture, self.car, zoom)
+        view = cv2.resize(picture, (OBSERVATION_SIZE, BAR_TOP), interpolation=cv2.INTER_AREA)
+        view = cv2.subtract(view, (DARKENING,) * 4)
+        return np.concatenate([view, indicator_bar(self.car, self.reward)])
 
 
 class Ground:
@@ -137,7 +142,7 @@ class Ground:
         self.repainted |= touched
 
     def look(self, position: tuple[float, float], angle: float, zoom: float) -> np.ndarray:
-        """What the camera sees: uint8 (192, 192, 3).
+        """What the camera sees above the indicator bar, at twice the observation's size: uint8 (168, 192, 3).
 
         Args:
             position: of the hull, world units; it stands in the middle, a quarter of the height above the lower edge.
@@ -162,47 +167,58 @@ class Ground:
             ]
         )
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        return cv2.warpAffine(self.levels[level], matrix, (size, size), flags=flags, borderMode=cv2.BORDER_CONSTANT)
+        shape = (size, SUPERSAMPLE * BAR_TOP)
+        return cv2.warpAffine(self.levels[level], matrix, shape, flags=flags, borderMode=cv2.BORDER_CONSTANT)
 
 
 def fill_road(texture: np.ndarray, polygon: list[tuple[float, float]], color) -> None:
     """Fill one tile of road or kerb; `polygon` in world units."""
-    points = (np.array(polygon) + reference.PLAYFIELD) * TEXTURE_SCALE - 0.5
-    points = np.round(points * 2**SHIFT).astype(np.int32)
+    points = to_fixed_point((np.array(polygon) + reference.PLAYFIELD) * TEXTURE_SCALE)
     cv2.fillConvexPoly(texture, points, [int(c) for c in color], cv2.LINE_8, SHIFT)
 
 
-def draw_car(picture: np.ndarray, car: car_dynamics.Car, angle: float, zoom: float) -> None:
-    """Draw wheels, their light marks and the hull into `picture` (192, 192, 3), seen by the camera of `Ground.look`."""
-    size = picture.shape[0]
+def draw_car(picture: np.ndarray, car: car_dynamics.Car, zoom: float) -> None:
+    """Draw wheels, their light marks and the hull into `picture` (168, 192, 3), seen by the camera of `Ground.look`."""
+    scale, middle = camera(zoom)
+    turn = np.array([wheel.angle - car.hull.angle for wheel in car.wheels])
+    cos, sin = np.cos(turn), np.sin(turn)
+    rotation = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)
+    offset = np.array([car.hull.GetLocalPoint(wheel.position) for wheel in car.wheels])
+    marks = [wheel_mark(wheel.phase) for wheel in car.wheels]
+    corners = np.array([np.concatenate([WHEEL_POLYGON, mark]) for mark in marks])
+    corners = corners @ rotation.transpose(0, 2, 1) + offset[:, None]
+    for corner in to_fixed_point(corners * scale + middle):
+        cv2.fillConvexPoly(picture, corner[:4], car_dynamics.WHEEL_COLOR, cv2.LINE_8, SHIFT)
+        cv2.fillConvexPoly(picture, corner[4:], car_dynamics.WHEEL_WHITE, cv2.LINE_8, SHIFT)
+    for polygon in hull_polygons(zoom):
+        cv2.fillConvexPoly(picture, polygon, HULL_COLOR, cv2.LINE_8, SHIFT)
+
+
+def camera(zoom: float) -> tuple[np.ndarray, np.ndarray]:
+    """How hull coordinates (world units, y forward) become pixels of the picture: (factors, position of the hull)."""
+    size = SUPERSAMPLE * OBSERVATION_SIZE
     scale = np.array([size / reference.WINDOW_W, -size / reference.WINDOW_H]) * zoom
-    middle = np.array([size / 2, 0.75 * size])
-    x0, y0 = car.hull.position
-    cos, sin = math.cos(angle), math.sin(angle)
-
-    def draw(body, polygon: np.ndarray, color: tuple[int, int, int]) -> None:
-        turn = body.angle - angle
-        c, s = math.cos(turn), math.sin(turn)
-        dx, dy = body.position[0] - x0, body.position[1] - y0
-        offset = np.array([cos * dx + sin * dy, cos * dy - sin * dx])
-        points = (polygon @ np.array([[c, s], [-s, c]]) + offset) * scale + middle - 0.5
-        cv2.fillConvexPoly(picture, np.round(points * 2**SHIFT).astype(np.int32), color, cv2.LINE_8, SHIFT)
-
-    for wheel in car.wheels:
-        draw(wheel, WHEEL_POLYGON, car_dynamics.WHEEL_COLOR)
-        mark = wheel_mark(wheel.phase)
-        if mark is not None:
-            draw(wheel, mark, car_dynamics.WHEEL_WHITE)
-    for polygon in HULL_POLYGONS:
-        draw(car.hull, polygon, HULL_COLOR)
+    return scale, np.array([size / 2, 0.75 * size])
 
 
-def wheel_mark(phase: float) -> np.ndarray | None:
-    """The light stripe on a turning wheel, (4, 2) in the wheel's coordinates; None while it is on the underside."""
+def to_fixed_point(points: np.ndarray) -> np.ndarray:
+    """Pixel coordinates as OpenCV's polygons want them; its pixel (0, 0) has its centre there, ours at (0.5, 0.5)."""
+    return np.round((points - 0.5) * 2**SHIFT).astype(np.int32)
+
+
+@functools.lru_cache(maxsize=64)
+def hull_polygons(zoom: float) -> list[np.ndarray]:
+    """The hull as it stands in the picture: always the same but for the zoom, because the camera is fixed to it."""
+    scale, middle = camera(zoom)
+    return [to_fixed_point(polygon * scale + middle) for polygon in HULL_POLYGONS]
+
+
+def wheel_mark(phase: float) -> np.ndarray:
+    """The light stripe on a turning wheel, (4, 2) in the wheel's coordinates; outside the picture while underneath."""
     sin1, sin2 = math.sin(phase), math.sin(phase + 1.2)
     cos1, cos2 = math.cos(phase), math.cos(phase + 1.2)
     if sin1 > 0 and sin2 > 0:
-        return None
+        return NOWHERE
     if sin1 > 0:
         cos1 = math.copysign(1, cos1)
     if sin2 > 0:
@@ -293,6 +309,9 @@ def place_car(env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, of
     heading = beta + turn
     car_racing.car.destroy()
     car_racing.car = car_dynamics.Car(car_racing.world, heading, x, y)
+    for wheel, (x, y) in zip(car_racing.car.wheels, car_dynamics.WHEELPOS, strict=True):
+        # Gymnasium's Car places its wheels as if it always faced north; the first step would jerk them into place.
+        wheel.position = car_racing.car.hull.GetWorldPoint((x * car_dynamics.SIZE, y * car_dynamics.SIZE))
     for body in car_racing.car.drawlist:
         body.linearVelocity = (-math.sin(heading) * speed, math.cos(heading) * speed)
     for wheel in car_racing.car.wheels:

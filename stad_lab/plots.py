@@ -1,0 +1,263 @@
+"""Figures: functions that take arrays and return a matplotlib Figure, or a moving picture, and nothing else.
+
+Each Figure's label (`figure.get_label()`) is its alternative text. Colours are Okabe and Ito's, which colour-blind eyes
+can tell apart; difference images lie on one diverging map centred at zero.
+"""
+
+import io
+
+import numpy as np
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from PIL import Image, ImageDraw, ImageFont
+
+BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
+COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
+DIFFERENCE_MAP = "PuOr_r"
+
+
+def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **kwargs) -> tuple[Figure, np.ndarray]:
+    """An empty figure of so many inches, outside pyplot's global state: (Figure, its axes (rows, columns))."""
+    figure = Figure(figsize=(width, height), layout="constrained", dpi=100)
+    return figure, figure.subplots(rows, columns, squeeze=False, **kwargs)
+
+
+def plot_pictures(rows: list[list[np.ndarray | None]], columns: list[str], names: list[str], title: str) -> Figure:
+    """Pictures in a grid.
+
+    Args:
+        rows: each a list of pictures: uint8 (H, W, 3), or a difference image float (H, W, 3) in [-1, 1], of which the
+            mean over the colours is shown on a diverging map, one scale for the whole figure; None leaves a gap.
+        columns: titles of the columns.
+        names: of the rows; "" for none.
+    """
+    figure, axes = new_figure(1.7 * len(columns) + 0.8, 1.75 * len(rows) + 0.75, len(rows), len(columns))
+    differences = [p.mean(axis=-1) for row in rows for p in row if p is not None and p.dtype != np.uint8]
+    limit = max([0.05, *(float(np.quantile(np.abs(d), 0.995)) for d in differences)])
+    scale, drawn = Normalize(-limit, limit), None
+    for row, name, row_axes in zip(rows, names, axes, strict=True):
+        for picture, axis in zip(row, row_axes, strict=True):
+            axis.set(xticks=[], yticks=[])
+            axis.spines[:].set_visible(False)
+            if picture is None:
+                continue
+            if picture.dtype == np.uint8:
+                axis.imshow(picture, interpolation="nearest")
+            else:
+                drawn = axis.imshow(picture.mean(axis=-1), cmap=DIFFERENCE_MAP, norm=scale, interpolation="nearest")
+        row_axes[0].set_ylabel(name, fontsize=9)
+    for column, axis in zip(columns, axes[0], strict=True):
+        axis.set_title(column, fontsize=9)
+    if drawn is not None:
+        figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label="difference d (of 1 = full brightness)")
+    figure.suptitle(title, fontsize=11)
+    figure.set_label(f"{title}. Rows: {', '.join(filter(None, names)) or 'one'}; columns: {', '.join(columns)}.")
+    return figure
+
+
+def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
+    """How much of the picture changes against how fast the car is.
+
+    Args:
+        speed: of the car in every frame, world units per second.
+        change: stride -> mean |d| of every frame.
+    """
+    figure, ((axis,),) = new_figure(6.5, 3.6)
+    for (stride, values), color in zip(change.items(), COLORS, strict=False):
+        correlation = np.corrcoef(speed, values)[0, 1]
+        axis.scatter(
+            speed, values, s=8, color=color, alpha=0.6, label=f"stride {stride}: correlation {correlation:.2f}"
+        )
+    axis.set(xlabel="true speed (world units per second)", ylabel="mean |d| of the frame")
+    axis.legend(frameon=False)
+    title = "The difference image grows with speed, and with the stride"
+    axis.set_title(title, fontsize=11)
+    figure.set_label(f"{title}: one point for every frame of an episode, strides {', '.join(map(str, change))}.")
+    return figure
+
+
+def plot_history(history: list[dict], title: str, unit: str) -> Figure:
+    """Training and held-out loss against the training step; `history` as `training.fit` returns it."""
+    figure, ((axis,),) = new_figure(6.5, 3.2)
+    steps = [entry["step"] for entry in history]
+    for kind, color, style in (("train", BLUE, "-"), ("heldout", ORANGE, "--")):
+        axis.plot(steps, [entry[kind]["total"] for entry in history], style, color=color, label=kind, marker=".")
+    axis.set(xlabel="training step", ylabel=f"loss ({unit})")
+    axis.legend(frameon=False)
+    axis.set_title(title, fontsize=11)
+    last = history[-1]
+    figure.set_label(
+        f"{title}. After {last['step']} steps: train {last['train']['total']:.3g},"
+        f" held-out {last['heldout']['total']:.3g} {unit}."
+    )
+    return figure
+
+
+def plot_bars(values: dict[str, np.ndarray], title: str, xlabel: str, ylabel: str) -> Figure:
+    """Sorted values, one panel for each name, on one scale: for example the KL of every latent dimension."""
+    figure, axes = new_figure(2.1 * len(values) + 0.6, 2.7, 1, len(values), sharey=True)
+    for (name, array), axis, color in zip(values.items(), axes[0], COLORS, strict=False):
+        axis.bar(np.arange(len(array)), np.sort(array)[::-1], color=color, width=0.9)
+        axis.set_title(name, fontsize=9)
+        axis.set_xlabel(xlabel, fontsize=9)
+    axes[0, 0].set_ylabel(ylabel)
+    figure.suptitle(title, fontsize=11)
+    figure.set_label(f"{title}. Bars sorted from high to low for {', '.join(values)}.")
+    return figure
+
+
+def plot_mixture(
+    logpi: np.ndarray, mean: np.ndarray, logsigma: np.ndarray, temperatures: list[float], actual: float | None = None
+) -> Figure:
+    """The density of one latent dimension that a mixture (each array (mixtures,)) stands for, at some temperatures."""
+    figure, ((axis,),) = new_figure(6.5, 3.4)
+    reach = 4 * np.exp(logsigma) * np.sqrt(max(temperatures))
+    z = np.linspace((mean - reach).min(), (mean + reach).max(), 600)
+    for temperature, color in zip(temperatures, COLORS, strict=False):
+        weights = np.exp((logpi - logpi.max()) / temperature)
+        weights /= weights.sum()
+        sigma = np.exp(logsigma) * np.sqrt(temperature)
+        parts = weights * np.exp(-0.5 * ((z[:, None] - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+        axis.plot(z, parts.sum(axis=1), color=color, lw=2, label=f"temperature {temperature:g}")
+        if len(temperatures) == 1:
+            axis.plot(z, parts, color="grey", lw=0.8, ls=":")
+    if actual is not None:
+        axis.axvline(actual, color=RED, ls="--", lw=1.5, label="what came")
+    axis.set(xlabel="next value of the latent dimension", ylabel="probability density", ylim=(0, None))
+    axis.legend(frameon=False)
+    title = "What M expects of one latent dimension"
+    axis.set_title(title, fontsize=11)
+    figure.set_label(f"{title}: density of the mixture at temperature {', '.join(f'{t:g}' for t in temperatures)}.")
+    return figure
+
+
+def plot_curves(curves: dict[str, np.ndarray], title: str, xlabel: str, ylabel: str) -> Figure:
+    """Lines over a common axis that counts 1, 2, 3, ..."""
+    figure, ((axis,),) = new_figure(6.5, 3.2)
+    for (name, values), color in zip(curves.items(), COLORS, strict=False):
+        axis.plot(np.arange(1, len(values) + 1), values, color=color, label=name)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
+    axis.legend(frameon=False)
+    axis.set_title(title, fontsize=11)
+    figure.set_label(f"{title}. Lines: {', '.join(curves)}.")
+    return figure
+
+
+def plot_search(landscape, generations: list[dict], shown: list[int], reach: float = 4.0) -> Figure:
+    """CMA-ES on a function of two variables: the population and the one-sigma ellipse of some generations.
+
+    Args:
+        landscape: function of an array (..., 2), to be minimised.
+        generations: each {"population" (n, 2), "mean" (2,), "covariance" (2, 2)}, the covariance with sigma squared.
+        shown: indices of the generations to draw, one panel each.
+        reach: the panels show [-reach, reach] in both variables.
+    """
+    figure, axes = new_figure(2.6 * len(shown) + 0.4, 3.1, 1, len(shown), sharex=True, sharey=True)
+    x = np.linspace(-reach, reach, 121)
+    height = landscape(np.stack(np.meshgrid(x, x), axis=-1))
+    for index, axis in zip(shown, axes[0], strict=True):
+        generation = generations[index]
+        axis.contourf(x, x, np.log(height - height.min() + 1e-2), 18, cmap="Greys_r", alpha=0.8)
+        axis.scatter(*generation["population"].T, s=16, color=ORANGE, edgecolor="black", lw=0.4, zorder=3)
+        values, vectors = np.linalg.eigh(generation["covariance"])
+        tilt = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        width, thickness = 2 * np.sqrt(values[1]), 2 * np.sqrt(values[0])
+        axis.add_patch(Ellipse(generation["mean"], width, thickness, angle=tilt, fill=False, ec=SKY, lw=2.5))
+        axis.plot(*generation["mean"], "+", color=RED, ms=10, mew=2)
+        axis.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x", aspect="equal")
+        axis.set_title(f"generation {index + 1}", fontsize=9)
+    axes[0, 0].set_ylabel("y")
+    title = "CMA-ES learns where to look: population (dots), mean (cross), one-sigma ellipse"
+    figure.suptitle(title if len(shown) > 2 else "Population, mean, one-sigma ellipse", fontsize=11)
+    figure.set_label(f"{title}, in generations {', '.join(str(i + 1) for i in shown)}.")
+    return figure
+
+
+def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str) -> Figure:
+    """Worst, average and best fitness against the generation: the paper's three figures in one.
+
+    Args:
+        curves: (3, generations), as `evolution.fitness_curves` makes them.
+        validation: generation -> mean return of the CMA mean on the validation tracks.
+    """
+    figure, ((axis,),) = new_figure(7.0, 3.8)
+    generation = np.arange(1, curves.shape[1] + 1)
+    for values, name, color in zip(curves, ("worst", "average", "best"), (RED, BLUE, GREEN), strict=True):
+        axis.plot(generation, values, color=color, lw=1.3, label=f"{name} agent of the generation")
+    if validation:
+        axis.plot(
+            *zip(*validation.items(), strict=True), "o--", color="black", ms=4, label="CMA mean, validation tracks"
+        )
+    axis.axhline(900, color="grey", lw=0.8, ls=":")
+    axis.set(xlabel="generation", ylabel="return of an episode", ylim=(min(-60, curves.min() - 20), 1000))
+    axis.legend(frameon=False, fontsize=9)
+    axis.set_title(title, fontsize=11)
+    figure.set_label(
+        f"{title}. In the last of {curves.shape[1]} generations: worst {curves[0, -1]:.0f},"
+        f" average {curves[1, -1]:.0f}, best {curves[2, -1]:.0f}."
+    )
+    return figure
+
+
+def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
+    """Every episode's return as a dot, one row for each name, with the mean as a bar."""
+    figure, ((axis,),) = new_figure(7.0, 0.8 * len(returns) + 1.4)
+    rng = np.random.default_rng(0)
+    for row, (values, color) in enumerate(zip(returns.values(), COLORS, strict=False)):
+        axis.scatter(values, row + rng.uniform(-0.22, 0.22, len(values)), s=12, color=color, alpha=0.6)
+        axis.plot([values.mean()] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
+        axis.text(1.01, row, f"mean {values.mean():.0f}", transform=axis.get_yaxis_transform(), va="center", fontsize=9)
+    axis.axvline(900, color="grey", lw=0.8, ls=":")
+    axis.set(
+        xlabel="return of an episode", yticks=range(len(returns)), yticklabels=list(returns), ylim=(len(returns), -1)
+    )
+    axis.set_title(title, fontsize=11)
+    means = ", ".join(f"{name} mean {values.mean():.0f}" for name, values in returns.items())
+    figure.set_label(f"{title}. {means}.")
+    return figure
+
+
+def difference_colors(difference: np.ndarray, limit: float = 0.15) -> np.ndarray:
+    """A difference image, float (..., 3) in [-1, 1], as uint8 colours of the diverging map: for moving pictures."""
+    from matplotlib import colormaps
+
+    shade = np.clip(difference.mean(axis=-1) / (2 * limit) + 0.5, 0, 1)
+    return (colormaps[DIFFERENCE_MAP](shade)[..., :3] * 255).round().astype(np.uint8)
+
+
+def moving_picture(columns: dict[str, np.ndarray], fps: float = 25, size: int = 192) -> bytes:
+    """An animated GIF of films side by side.
+
+    Args:
+        columns: title -> film, uint8 (frames, H, W, 3), square; all of one length.
+        fps: pictures per second.
+        size: width and height of each film in the GIF, pixels.
+
+    Raises:
+        ValueError: no films, or films of different lengths.
+    """
+    lengths = {title: len(film) for title, film in columns.items()}
+    if len(set(lengths.values())) != 1 or 0 in lengths.values():
+        raise ValueError(f"films of lengths {lengths}: expected films of one length, at least one frame")
+    header, gap = 20, 6
+    font = ImageFont.load_default(13)
+    pages = []
+    for pictures in zip(*columns.values(), strict=True):
+        page = Image.new("RGB", (len(columns) * (size + gap) - gap, size + header), "white")
+        draw = ImageDraw.Draw(page)
+        for place, (title, picture) in enumerate(zip(columns, pictures, strict=True)):
+            left = place * (size + gap)
+            draw.text((left + size / 2, header / 2), title, fill="black", font=font, anchor="mm")
+            page.paste(Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST), (left, header))
+        pages.append(page.quantize(64, dither=Image.Dither.NONE))
+    buffer = io.BytesIO()
+    pages[0].save(buffer, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
+    return buffer.getvalue()
+
+
+def to_png(figure: Figure) -> bytes:
+    """A Figure as PNG."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()
