@@ -4,6 +4,7 @@ import argparse
 import dataclasses
 import json
 import sys
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from stad_lab.agent import load_agent
@@ -11,7 +12,7 @@ from stad_lab.autoencoder import VARIANTS
 from stad_lab.checkpoints import write_bytes
 from stad_lab.evaluation import describe, evaluate, save_evaluation
 from stad_lab.film import film_agent
-from stad_lab.pipeline import PRETRAINED, STAGES, ship, train
+from stad_lab.pipeline import STAGES, ship, train
 from stad_lab.settings import PRESETS, Settings
 
 
@@ -63,7 +64,9 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument("--first-track", type=int, default=0, help="seed of the first track, default 0")
     command.add_argument("--fast", action="store_true", help="draw with the fast renderer (not for reports)")
     command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
-    command.add_argument("--json", type=Path, help="where to write the result; default evaluation.json in the run")
+    command.add_argument(
+        "--json", type=Path, help="where to write the result; default evaluation-VARIANT.json in the run, or here"
+    )
 
     command = commands.add_parser(
         "ship", parents=[variant], help="copy a run's weights and records to stad_lab/pretrained"
@@ -93,8 +96,8 @@ def changed_settings(preset: str | None, changes: list[str]) -> Settings:
         if not equals:
             raise ValueError(f"--set {change!r}: expected NAME=VALUE, for example stride=2")
         try:
-            values[name] = text if kinds.get(name, str) is str else kinds[name](json.loads(text))
-        except (ValueError, TypeError):
+            values[name] = text if kinds.get(name, str) is str else json.loads(text)
+        except json.JSONDecodeError:
             raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}") from None
     return Settings.preset(preset, **values)
 
@@ -111,7 +114,7 @@ def main(arguments: list[str] | None = None) -> int:
             result = evaluate(
                 options.variant, options.path, options.episodes, options.first_track, options.fast, options.processes
             )
-            file = options.json or (options.path or PRETRAINED / options.variant) / "evaluation.json"
+            file = options.json or (options.path or Path()) / f"evaluation-{options.variant}.json"
             save_evaluation(file, result)
             print(describe(result))
             print(f"  every episode: {file}")
@@ -121,11 +124,12 @@ def main(arguments: list[str] | None = None) -> int:
             agent = load_agent(options.variant, options.path)
             write_bytes(options.out, film_agent(agent, options.track, options.first, options.frames))
             print(f"filmed to {options.out}")
-    except (ValueError, FileNotFoundError, FloatingPointError) as error:
+    except (ValueError, OSError, FloatingPointError, BrokenProcessPool) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print("\nstopped; the same command goes on from here", file=sys.stderr)
+        again = "; the same command goes on from the last checkpoint" if options.command == "train" else ""
+        print(f"\nstopped{again}", file=sys.stderr)
         return 130
     return 0
 

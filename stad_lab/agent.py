@@ -49,6 +49,7 @@ class Agent:
     def reset(self) -> None:
         """Forget the past: every episode begins with this."""
         self.memory = FrameMemory(self.stride)
+        self.cars: np.ndarray | None = None  # which of the cars of the first step still drive
         self.state: tuple[torch.Tensor, torch.Tensor] | None = None
         self.latents: np.ndarray | None = None
         self.hidden: np.ndarray | None = None
@@ -68,28 +69,37 @@ class Agent:
         Raises:
             ValueError: as `act`, or another number of cars than in the step before without a `reset`.
         """
+        self._check_count(len(observations))
         frames = np.stack([to_frame(observation, self.crop_bar) for observation in observations])
-        if self.latents is not None and len(frames) != len(self.latents):
-            raise ValueError(
-                f"{len(frames)} observations after {len(self.latents)} in the step before:"
-                " call agent.reset() when an episode begins"
-            )
         frame, difference = to_pictures(frames, self.memory.push(frames))
         latents, _ = self.autoencoder.encode(frame, difference)
         if self.state is None:
             self.state = tuple(torch.zeros(1, len(frames), self.mdn_rnn.hidden_size) for _ in range(2))
         self.latents, self.hidden = latents.numpy(), self.state[0][0].numpy()
-        actions = control(self.parameters, np.concatenate([self.latents, self.hidden], axis=1))
+        parameters = self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
+        actions = control(parameters, np.concatenate([self.latents, self.hidden], axis=1))
         self.state = self.mdn_rnn.step(latents, torch.from_numpy(actions), self.state)
         return actions
 
     def keep(self, cars: np.ndarray) -> None:
-        """Go on with some of the cars only: `cars` are their indices, or a mask, among the present ones."""
+        """Go on with some of the cars only, until the next reset: `cars` are their indices among the present ones."""
         self.memory.frames = type(self.memory.frames)((f[cars] for f in self.memory.frames), self.stride + 1)
         self.state = tuple(part[:, cars] for part in self.state)
-        self.latents, self.hidden = self.latents[cars], self.hidden[cars]
-        if self.parameters.ndim == 2:
-            self.parameters = self.parameters[cars]
+        self.latents, self.hidden, self.cars = self.latents[cars], self.hidden[cars], self.cars[cars]
+
+    def _check_count(self, count: int) -> None:
+        if self.cars is None:
+            if self.parameters.ndim == 2 and count != len(self.parameters):
+                raise ValueError(
+                    f"{count} observations for {len(self.parameters)} controllers:"
+                    " expected one observation for each row of the parameters"
+                )
+            self.cars = np.arange(count)
+        if count != len(self.cars) or count == 0:
+            raise ValueError(
+                f"{count} observations, expected {len(self.cars) or 'at least 1'}, as in the step before:"
+                " call agent.reset() when an episode begins"
+            )
 
 
 def drive(
@@ -156,7 +166,7 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
     if path is None and not (folder / "controller.safetensors").exists():
         shipped = ", ".join(sorted(file.parent.name for file in PRETRAINED.glob("*/controller.safetensors")))
         raise FileNotFoundError(
-            f"no trained {variant!r} agent comes with stad_lab, only {shipped}: train one with"
+            f"no trained {variant!r} agent comes with stad_lab, only {shipped or 'none at all'}: train one with"
             f" `python -m stad_lab train --variant {variant} --out runs/{variant}` and give path='runs/{variant}'"
         )
     if not folder.is_dir() or not any(folder.iterdir()):

@@ -131,7 +131,7 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
     """
     path = Path(folder) / "autoencoder.safetensors"
     if path.exists():
-        load_autoencoder(path, variant)
+        check_facts(path, load_autoencoder(path, variant)[1], settings)
         return False
     rollouts = Rollouts(rollouts_folder)
     torch.manual_seed(settings.seed)
@@ -161,6 +161,16 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
     save_autoencoder(path, autoencoder, settings, history)
     checkpoint.unlink()
     return True
+
+
+def check_facts(path: Path, facts: dict, settings: Settings) -> None:
+    """Raise ValueError if weights were made with other settings, as far as their facts tell, than asked for now."""
+    for name, wanted in settings.as_dict().items():
+        if name in facts and facts[name] != wanted:
+            raise ValueError(
+                f"{path} was made with {name}={facts[name]!r}, and now {name}={wanted!r} is asked for:"
+                " choose another folder, or the same settings"
+            )
 
 
 def save_autoencoder(path: Path, autoencoder: AutoEncoder, settings: Settings, history: list) -> None:

@@ -49,10 +49,11 @@ def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
     """
     weights = parameters[..., :-ACTION_SIZE].reshape(-1, ACTION_SIZE, features.shape[1])
     bias = parameters[..., -ACTION_SIZE:].reshape(-1, ACTION_SIZE)
-    action = squash((weights * features[:, None]).sum(-1) + bias)
-    if not np.isfinite(action).all():
-        raise ValueError(f"action {action[~np.isfinite(action).all(axis=1)][0]} is not finite: check z, h and C")
-    return action.astype(np.float32)
+    raw = (weights * features[:, None]).sum(-1) + bias
+    if not np.isfinite(raw).all():
+        bad = raw[~np.isfinite(raw).all(axis=1)][0]
+        raise ValueError(f"action {bad} before squashing, expected finite numbers: check z, h and C for NaN")
+    return squash(raw).astype(np.float32)
 
 
 def squash(raw: np.ndarray) -> np.ndarray:

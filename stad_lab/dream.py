@@ -13,7 +13,7 @@ from stad_lab.agent import Agent
 from stad_lab.autoencoder import AutoEncoder
 from stad_lab.car_racing import MAX_FRAMES
 from stad_lab.controller import control
-from stad_lab.mdn_rnn import ACTION_SIZE, MDNRNN, Mixture, State, sample_mixture
+from stad_lab.mdn_rnn import ACTION_SIZE, MDNRNN, Mixture, State, check_temperature, sample_mixture
 
 
 class DreamEnv(gym.Env):
@@ -43,8 +43,7 @@ class DreamEnv(gym.Env):
         max_frames: int = MAX_FRAMES,
         render_mode: str | None = None,
     ):
-        if not temperature > 0:
-            raise ValueError(f"temperature={temperature}: expected a number above 0; 1 is what M has learned")
+        check_temperature(temperature)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: a dream can be rendered as 'rgb_array' only, or not (None)")
         self.autoencoder, self.mdn_rnn = autoencoder, mdn_rnn

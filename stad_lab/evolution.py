@@ -15,7 +15,7 @@ import cma
 import numpy as np
 from tqdm.auto import tqdm
 
-from stad_lab.agent import Agent, drive, load_world_model, save_controller
+from stad_lab.agent import Agent, drive, load_controller, load_world_model, save_controller
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.controller import initial_parameters
 from stad_lab.parallel import make_executor
@@ -42,10 +42,16 @@ def evolve(variant: str, settings: Settings, folder: Path) -> bool:
     """
     folder = Path(folder)
     log = read_log(variant, settings, folder)
-    if len(log["generations"]) >= settings.generations:
+    controller = folder / CONTROLLER
+    if controller.exists():
+        load_controller(controller)
+    if len(log["generations"]) >= settings.generations and controller.exists():
         return False
     autoencoder, mdn_rnn, *_ = load_world_model(folder, variant)
     start = initial_parameters(autoencoder.latent_size, mdn_rnn.hidden_size, settings.initial_gas)
+    if log["best"] and not controller.exists():
+        best = replay(start, settings, log["generations"][: log["best"]["generation"]])
+        save_controller(controller, best.mean, variant=variant, **log["best"])
     strategy = replay(start, settings, log["generations"])
     executor = make_executor(settings.processes)
     done = len(log["generations"])

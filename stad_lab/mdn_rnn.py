@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from stad_lab.autoencoder import REMEDY, AutoEncoder, load_autoencoder, to_pictures
+from stad_lab.autoencoder import REMEDY, AutoEncoder, check_facts, load_autoencoder, to_pictures
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
@@ -97,16 +97,21 @@ def sample_mixture(mixture: Mixture, temperature: float, generator: torch.Genera
         generator: the random source; None for torch's own.
 
     Raises:
-        ValueError: a temperature that is not above 0.
+        ValueError: a temperature that is not a finite number above 0.
     """
-    if not temperature > 0:
-        raise ValueError(f"temperature={temperature}: expected a number above 0; 1 is what M has learned")
+    check_temperature(temperature)
     weights = (mixture.logpi / temperature).softmax(-1)
     flat = weights.reshape(-1, weights.shape[-1])
     choice = torch.multinomial(flat, 1, generator=generator).view(*weights.shape[:-1], 1)
     mean, logsigma = mixture.mean.gather(-1, choice)[..., 0], mixture.logsigma.gather(-1, choice)[..., 0]
     noise = torch.randn(mean.shape, generator=generator)
     return mean + logsigma.exp() * math.sqrt(temperature) * noise
+
+
+def check_temperature(temperature: float) -> None:
+    """Raise ValueError unless the temperature is a finite number above 0."""
+    if not 0 < temperature < math.inf:
+        raise ValueError(f"temperature={temperature}: expected a finite number above 0; 1 is what M has learned")
 
 
 @torch.no_grad()
@@ -155,9 +160,11 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     """
     path = Path(folder) / "mdn_rnn.safetensors"
     if path.exists():
-        load_mdn_rnn(path)
+        check_facts(path, load_mdn_rnn(path)[1], settings)
         return False
-    autoencoder, _ = load_autoencoder(path.with_name("autoencoder.safetensors"), variant)
+    v_path = path.with_name("autoencoder.safetensors")
+    autoencoder, v_facts = load_autoencoder(v_path, variant)
+    check_facts(v_path, v_facts, settings)
     rollouts = Rollouts(rollouts_folder)
     torch.manual_seed(settings.seed)
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)

@@ -17,7 +17,14 @@ def make_executor(processes: int) -> ProcessPoolExecutor:
     """A pool of `processes` fresh Python processes that compute with one thread each.
 
     They ignore Ctrl-C (the parent decides what an interrupt means) and end themselves when the parent is gone.
+
+    Raises:
+        ValueError: fewer than 1 process.
     """
+    if processes < 1:
+        raise ValueError(
+            f"processes={processes}: expected at least 1; as many as the machine has cores is a good choice"
+        )
     context = multiprocessing.get_context("spawn")  # fork and torch's threads do not go together
     return ProcessPoolExecutor(processes, mp_context=context, initializer=start_worker)
 

@@ -59,7 +59,6 @@ def train(
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
     record = open_record(folder, variant, settings)
-    save_json(folder / "record.json", record)
     stages = {
         "rollouts": lambda: collect_rollouts(settings, rollouts_folder),
         "autoencoder": lambda: train_autoencoder(variant, settings, rollouts_folder, folder),
@@ -91,7 +90,9 @@ def open_record(folder: Path, variant: str, settings: Settings) -> dict:
     """
     path = folder / "record.json"
     if not path.exists():
-        return {"variant": variant, "settings": settings.as_dict(), "made_with": provenance(), "seconds": {}}
+        record = {"variant": variant, "settings": settings.as_dict(), "made_with": provenance(), "seconds": {}}
+        save_json(path, record)
+        return record
     record = load_json(path)
     check_same_run(
         folder, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}

@@ -128,6 +128,8 @@ def collect_rollouts(settings: Settings, folder: Path) -> bool:
     if not missing:
         return False
     folder.mkdir(parents=True, exist_ok=True)
+    for left_over in folder.glob(".*.part"):
+        left_over.unlink()
     save_json(manifest_path, manifest)
     executor = make_executor(settings.processes)
     try:
@@ -150,13 +152,16 @@ class Rollouts:
 
     Raises:
         FileNotFoundError: no manifest, or a block is missing.
-        ValueError: a block is damaged: its size or checksum is not the manifest's.
+        ValueError: the collection is not complete, or a block is damaged: its checksum is not the manifest's.
     """
 
     def __init__(self, folder: Path):
         self.folder = Path(folder)
         remedy = f"collect the rollouts first: python -m stad_lab train ... --rollouts {self.folder}"
         self.manifest = load_json(self.folder / "manifest.json", remedy)
+        found, wanted = len(self.manifest["blocks"]), self.manifest["settings"]["episodes"]
+        if found != wanted:
+            raise ValueError(f"{self.folder} holds {found} of {wanted} episodes: {remedy}")
         self.frames, self.actions = [], []
         for entry in self.manifest["blocks"]:
             self.frames.append(self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8))

@@ -74,7 +74,7 @@ class Settings:
     """Adam's rate at the start; it falls to a tenth along a cosine."""
 
     # C, evolved by CMA-ES
-    generations: int = 70
+    generations: int = 100
     """Generations of CMA-ES."""
     population: int = 16
     """Agents in a generation."""
@@ -90,7 +90,7 @@ class Settings:
     """Frames of a training episode, at most; CarRacing's own limit is 1,000."""
     cars: int = 16
     """Cars that one process drives in step, with one batch through V and M."""
-    validate_every: int = 10
+    validate_every: int = 5
     """Generations between two looks at the CMA mean on the validation tracks."""
     validation_tracks: int = 16
     """Tracks of such a look."""
@@ -137,7 +137,7 @@ class Settings:
 
 
 ZERO_ALLOWED = ("seed", "patience", "random_starts", "kl_weight", "free_bits", "difference_weight")
-AT_LEAST = {"population": 4, "m_sequence": 2}
+AT_LEAST = {"episodes": 2, "population": 4, "m_sequence": 2, "initial_gas": -100.0}
 
 
 def check_value(name: str, kind: type, value) -> None:
@@ -146,7 +146,7 @@ def check_value(name: str, kind: type, value) -> None:
         value = float(value)
     if type(value) is not kind:
         raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
-    if kind in (int, float) and name != "initial_gas":
+    if kind in (int, float):
         lowest = AT_LEAST.get(name, 0 if name in ZERO_ALLOWED else 1 if kind is int else 1e-12)
         highest = 1.0 if name == "random_starts" else 1e12
         if not lowest <= value <= highest:

@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
 
-RECORDS = 20  # entries of the history, and checkpoints, in a run
+RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
 
 def fit(
@@ -31,20 +31,19 @@ def fit(
         batch_losses: step -> named losses of that step's batch; "total" is minimised.
         heldout_losses: named losses on held-out data, computed without gradients.
         learning_rate: Adam's rate at the start; it falls to a tenth of it along a cosine.
-        checkpoint: file of the training state, read if it exists, written 20 times a run and on interrupt.
+        checkpoint: file of the training state, read if it exists, written with every entry of the history.
         label: what the progress bar says.
 
     Returns:
-        The history: 20 entries {"step", "train": means since the last entry, "heldout"}.
+        The history: entries {"step", "train": means since the last entry, "heldout"}, a twentieth of the run apart.
 
     Raises:
         ValueError: the checkpoint belongs to another model or is damaged.
         FloatingPointError: the loss is not finite.
     """
     optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate)
-    start, sums, history = 0, {}, []
-    if checkpoint.exists():
-        start, sums, history = load_state(checkpoint, model, optimizer)
+    history = load_state(checkpoint, model, optimizer) if checkpoint.exists() else []
+    start, sums = history[-1]["step"] if history else 0, {}
     every = max(1, steps // RECORDS)
     step = start
     try:
@@ -63,17 +62,13 @@ def fit(
             optimizer.step()
             for name, loss in losses.items():
                 sums[name] = sums.get(name, 0.0) + loss.item()
-            if (step + 1) % every == 0:
-                history.append(
-                    {
-                        "step": step + 1,
-                        "train": {name: total / every for name, total in sums.items()},
-                        "heldout": heldout_losses(),
-                    }
-                )
+            if (step + 1) % every == 0 or step + 1 == steps:
+                count = step + 1 - (history[-1]["step"] if history else 0)
+                means = {name: total / count for name, total in sums.items()}
+                history.append({"step": step + 1, "train": means, "heldout": heldout_losses()})
                 sums = {}
                 progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
-                save_state(checkpoint, model, optimizer, step + 1, sums, history)
+                save_state(checkpoint, model, optimizer, history)
     except KeyboardInterrupt:
         # The interrupt may have come in mid-update; the checkpoint of the last record is whole, so it stays.
         print(f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint")
@@ -81,16 +76,16 @@ def fit(
     return history
 
 
-def save_state(path: Path, model, optimizer, step: int, sums: dict, history: list) -> None:
-    """Write everything the next step depends on: weights, Adam's moments, and where we are."""
+def save_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, history: list) -> None:
+    """Write everything the next step depends on: weights, Adam's moments, and the history, which says where we are."""
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for number, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{number}.{name}": tensor for name, tensor in moments.items()}
-    save_tensors(path, tensors, step=step, sums=sums, history=history)
+    save_tensors(path, tensors, history=history)
 
 
-def load_state(path: Path, model, optimizer) -> tuple[int, dict, list]:
-    """Restore what `save_state` wrote into `model` and `optimizer`; returns (step, sums, history)."""
+def load_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> list:
+    """Restore what `save_state` wrote into `model` and `optimizer`; returns the history."""
     tensors, facts = load_tensors(path, "run the same command again, from the start")
     weights = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith("model.")}
     load_into(model, weights, path)
@@ -100,4 +95,4 @@ def load_state(path: Path, model, optimizer) -> tuple[int, dict, list]:
             _, number, moment = name.split(".")
             state["state"].setdefault(int(number), {})[moment] = tensor
     optimizer.load_state_dict(state)
-    return facts["step"], facts["sums"], facts["history"]
+    return facts["history"]

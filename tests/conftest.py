@@ -1,0 +1,85 @@
+"""What the tests share: small settings, one real run of the real command line, and a road-following test driver."""
+
+import os
+
+os.environ.setdefault("STAD_LAB_SETTINGS", "quick")
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # check_env tries render_mode="human": no window may open
+
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+from torch.optim.optimizer import register_optimizer_step_post_hook
+
+from stad_lab import load_agent, make_env
+
+torch.set_num_threads(1)  # the models here are tiny: more threads would only get in each other's way
+
+
+def run_stad_lab(*arguments):
+    """Run the real command line in a process of its own."""
+    command = [sys.executable, "-m", "stad_lab", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="session")
+def command_line():
+    """The command line as a function."""
+    return run_stad_lab
+
+
+@pytest.fixture(scope="session")
+def quick_training(tmp_path_factory):
+    """One run made by the real command: (its folder, the finished process, its duration in seconds)."""
+    folder = tmp_path_factory.mktemp("runs") / "quick"
+    begin = time.perf_counter()
+    process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder)
+    assert process.returncode == 0, process.stderr
+    return folder, process, time.perf_counter() - begin
+
+
+@pytest.fixture(scope="session")
+def quick_run(quick_training):
+    """The folder of a finished run. Tests that change files copy it first."""
+    return quick_training[0]
+
+
+@pytest.fixture
+def agent(quick_run):
+    """The agent of the run."""
+    return load_agent("input_output", quick_run)
+
+
+@pytest.fixture(scope="session")
+def observations():
+    """Sixty observations of one drive, uint8 (60, 96, 96, 3)."""
+    env = make_env()
+    seen = [env.reset(seed=7)[0]]
+    env.action_space.seed(7)
+    while len(seen) < 60:
+        seen.append(env.step(env.action_space.sample())[0])
+    env.close()
+    return seen
+
+
+@pytest.fixture
+def interrupt_after():
+    """interrupt_after(n) raises KeyboardInterrupt after n more updates of a training; returns a handle to remove()."""
+    handles = []
+
+    def interrupt(updates):
+        left = [updates]
+
+        def count(*_):
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+
+        handles.append(register_optimizer_step_post_hook(count))
+        return handles[-1]
+
+    yield interrupt
+    for handle in handles:
+        handle.remove()

@@ -1,0 +1,211 @@
+"""V: four variants, the loss term by term, and a training that an interrupt does not change."""
+
+import numpy as np
+import pytest
+import torch
+
+from stad_lab.autoencoder import (
+    VARIANTS,
+    AutoEncoder,
+    autoencoder_losses,
+    load_autoencoder,
+    save_autoencoder,
+    to_pictures,
+    train_autoencoder,
+)
+from stad_lab.checkpoints import load_tensors
+from stad_lab.frames import difference_image
+from stad_lab.settings import Settings
+
+
+def make_autoencoder(variant, seed=0, width=4):
+    """A small V with fixed random weights."""
+    torch.manual_seed(seed)
+    return AutoEncoder(variant, latent_size=32, width=width)
+
+
+def make_batch(count=3, seed=0):
+    """Frames, difference images and noise."""
+    rng = np.random.default_rng(seed)
+    frames, earlier = rng.integers(0, 256, (2, count, 64, 64, 3), np.uint8)
+    return *to_pictures(frames, earlier), torch.from_numpy(rng.standard_normal((count, 32), np.float32))
+
+
+@pytest.mark.parametrize(
+    ("variant", "seen", "redrawn"), [("frame", 3, 3), ("input", 6, 3), ("output", 3, 6), ("input_output", 6, 6)]
+)
+def test_each_variant_sees_and_redraws_its_pictures(variant, seen, redrawn):
+    autoencoder = make_autoencoder(variant)
+    frame, difference, _ = make_batch()
+    assert autoencoder.encoder[0].in_channels == seen
+    assert autoencoder.decoder[-1].out_channels == redrawn
+    mu, logvar = autoencoder.encode(frame, difference)
+    assert mu.shape == logvar.shape == (3, 32)
+    sees_difference = not torch.equal(mu, autoencoder.encode(frame, -difference)[0])
+    assert sees_difference == (seen == 6)
+    drawn_frame, drawn_difference = autoencoder.decode(mu)
+    assert drawn_frame.shape == frame.shape
+    assert 0 <= drawn_frame.min() <= drawn_frame.max() <= 1
+    if redrawn == 3:
+        assert drawn_difference is None
+    else:
+        assert drawn_difference.shape == difference.shape
+        assert -1 <= drawn_difference.min() < 0 < drawn_difference.max() <= 1
+
+
+def test_the_four_variants_are_those_of_the_paper():
+    assert VARIANTS == ("frame", "input", "output", "input_output")
+
+
+def test_an_unknown_variant_is_refused_with_the_choices():
+    with pytest.raises(ValueError, match="unknown variant 'both': choose one of frame, input, output, input_output"):
+        AutoEncoder("both")
+
+
+def test_a_drawn_difference_can_be_as_negative_as_it_can_be_positive():
+    autoencoder = make_autoencoder("output")
+    last = autoencoder.decoder[-1]
+    for bias in (-50.0, 50.0):
+        last.bias.data.fill_(bias)
+        frame, difference = (drawn.detach() for drawn in autoencoder.decode(torch.zeros(1, 32)))
+        assert frame.mean() == pytest.approx(0 if bias < 0 else 1)
+        assert difference.mean() == pytest.approx(-1 if bias < 0 else 1)
+
+
+def test_pictures_are_the_frames_and_differences_as_floats():
+    frames, earlier = np.random.default_rng(0).integers(0, 256, (2, 3, 64, 64, 3), np.uint8)
+    frame, difference = to_pictures(frames, earlier)
+    assert frame.shape == difference.shape == (3, 3, 64, 64)
+    assert np.allclose(frame.permute(0, 2, 3, 1), frames / 255, atol=1e-6)
+    assert np.allclose(difference.permute(0, 2, 3, 1), difference_image(frames, earlier), atol=1e-6)
+
+
+def test_kl_is_that_of_torch_distributions():
+    autoencoder = make_autoencoder("input")
+    autoencoder.encoder[-1].weight.data *= 30  # far from N(0, 1)
+    frame, difference, noise = make_batch()
+    mu, logvar = autoencoder.encode(frame, difference)
+    normal = torch.distributions.Normal
+    expected = torch.distributions.kl_divergence(normal(mu, torch.exp(logvar / 2)), normal(0.0, 1.0)).sum(1).mean()
+    kl = autoencoder_losses(autoencoder, frame, difference, noise, Settings())["kl"]
+    assert kl > 1
+    assert torch.allclose(kl, expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.parametrize("free_bits", [0.0, 0.5])
+def test_the_loss_is_the_plain_sum_of_its_named_terms(variant, free_bits):
+    settings = Settings(kl_weight=0.7, difference_weight=3.0, free_bits=free_bits)
+    autoencoder = make_autoencoder(variant)
+    frame, difference, noise = make_batch()
+    losses = autoencoder_losses(autoencoder, frame, difference, noise, settings)
+    mu, logvar = (part.detach().double().numpy() for part in autoencoder.encode(frame, difference))
+    z = mu + np.sqrt(np.exp(logvar)) * noise.numpy()
+    drawn = [None if d is None else d.detach().numpy() for d in autoencoder.decode(torch.from_numpy(z).float())]
+    kl = [sum(0.5 * (m**2 + np.exp(v) - 1 - v) for m, v in zip(*row, strict=True)) for row in zip(mu, logvar)]  # noqa: B905
+    expected = {"kl": np.mean(kl), "frame_error": ((drawn[0] - frame.numpy()) ** 2).sum() / 3}
+    total = expected["frame_error"] + 0.7 * np.mean([max(one, free_bits * 32) for one in kl])
+    if "output" in variant:
+        expected["difference_error"] = ((drawn[1] - difference.numpy()) ** 2).sum() / 3
+        total += 3.0 * expected["difference_error"]
+    expected["total"] = total
+    assert {name: loss.item() for name, loss in losses.items()} == pytest.approx(expected, rel=1e-4)
+
+
+def gradient(settings):
+    """The gradient of the loss with respect to the encoder's last weights."""
+    autoencoder = make_autoencoder("input")
+    autoencoder_losses(autoencoder, *make_batch(), settings)["total"].backward()
+    return autoencoder.encoder[-1].weight.grad
+
+
+def test_under_the_floor_of_free_bits_the_kl_has_no_gradient():
+    without_kl = gradient(Settings(kl_weight=0.0))
+    assert torch.equal(gradient(Settings(kl_weight=100.0, free_bits=5.0)), without_kl)
+    assert not torch.equal(gradient(Settings(kl_weight=100.0, free_bits=0.0)), without_kl)
+
+
+def test_the_noise_is_reparameterised():
+    autoencoder = make_autoencoder("frame")
+    frame, difference, noise = make_batch()
+    settings = Settings(kl_weight=0.0)
+    silent = autoencoder_losses(autoencoder, frame, difference, torch.zeros_like(noise), settings)["total"]
+    redrawn = autoencoder.reconstruct(frame, difference)[0]
+    assert torch.allclose(silent, ((redrawn - frame) ** 2).sum() / 3)
+    noisy = autoencoder_losses(autoencoder, frame, difference, noise, settings)["total"]
+    assert noisy != silent
+    noisy.backward()
+    mu_rows, logvar_rows = autoencoder.encoder[-1].weight.grad.chunk(2)
+    assert mu_rows.abs().max() > 0
+    assert logvar_rows.abs().max() > 0
+
+
+def test_reconstruct_decodes_the_mean_and_repeats_itself():
+    autoencoder = make_autoencoder("input_output")
+    frame, difference, _ = make_batch()
+    decoded = autoencoder.decode(autoencoder.encode(frame, difference)[0])
+    for redrawn in (autoencoder.reconstruct(frame, difference), autoencoder.reconstruct(frame, difference)):
+        assert torch.equal(redrawn[0], decoded[0])
+        assert torch.equal(redrawn[1], decoded[1])
+
+
+def test_training_lowers_the_held_out_loss(quick_run):
+    history = load_autoencoder(quick_run / "autoencoder.safetensors")[1]["history"]
+    assert [entry["step"] for entry in history] == list(range(2, 41, 2))
+    assert history[-1]["heldout"]["total"] < history[0]["heldout"]["total"]
+    assert history[-1]["train"]["total"] < history[0]["train"]["total"]
+    assert history[0]["train"].keys() == {"total", "frame_error", "difference_error", "kl"}
+
+
+@pytest.mark.parametrize("interrupted_in", [1, 17])
+def test_an_interrupted_training_equals_an_uninterrupted_one_bit_for_bit(
+    interrupted_in, quick_run, tmp_path, interrupt_after
+):
+    settings = Settings.preset("quick", width=4)
+    for folder in ("one_go", "interrupted"):
+        if folder == "interrupted":
+            hook = interrupt_after(interrupted_in)
+            with pytest.raises(KeyboardInterrupt):
+                train_autoencoder("output", settings, quick_run / "rollouts", tmp_path / folder)
+            hook.remove()
+            assert not (tmp_path / folder / "autoencoder.safetensors").exists()
+        assert train_autoencoder("output", settings, quick_run / "rollouts", tmp_path / folder)
+    files = [tmp_path / folder / "autoencoder.safetensors" for folder in ("one_go", "interrupted")]
+    (one_go, one_go_facts), (resumed, resumed_facts) = (load_tensors(file) for file in files)
+    assert all(torch.equal(one_go[name], resumed[name]) for name in one_go | resumed)
+    assert one_go_facts == resumed_facts
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert [file.name for file in files[1].parent.iterdir()] == ["autoencoder.safetensors"]  # no checkpoint is left
+
+
+def test_a_loss_that_is_not_finite_stops_the_training(quick_run, tmp_path):
+    settings = Settings.preset("quick", width=4, difference_weight=1e12, kl_weight=1e12, v_learning_rate=1e6)
+    with pytest.raises(FloatingPointError, match=r"train V .output.: the loss is .* in step .*lower the learning rate"):
+        train_autoencoder("output", settings, quick_run / "rollouts", tmp_path)
+
+
+def test_saved_weights_are_loaded_to_the_same_pictures(tmp_path):
+    autoencoder = make_autoencoder("input_output")
+    save_autoencoder(tmp_path / "v.safetensors", autoencoder, Settings(stride=3, crop_bar=False), [])
+    loaded, facts = load_autoencoder(tmp_path / "v.safetensors", "input_output")
+    frame, difference, _ = make_batch()
+    assert torch.allclose(loaded.reconstruct(frame, difference)[1], autoencoder.reconstruct(frame, difference)[1])
+    assert (facts["stride"], facts["crop_bar"], facts["width"]) == (3, False, 4)
+
+
+def test_weights_of_another_variant_are_refused(quick_run):
+    with pytest.raises(ValueError, match="holds variant 'input_output', and 'frame' was asked for: give its own run"):
+        load_autoencoder(quick_run / "autoencoder.safetensors", "frame")
+
+
+def test_weights_of_another_part_are_refused(quick_run):
+    with pytest.raises(ValueError, match="holds 'mdn_rnn': expected the weights of an autoencoder"):
+        load_autoencoder(quick_run / "mdn_rnn.safetensors")
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    autoencoder = make_autoencoder("frame")
+    autoencoder.encoder[0].bias.data[1] = float("nan")
+    save_autoencoder(tmp_path / "v.safetensors", autoencoder, Settings(), [])
+    with pytest.raises(ValueError, match=r"v.safetensors holds values that are not finite in 'encoder.0.bias': train"):
+        load_autoencoder(tmp_path / "v.safetensors")

@@ -1,0 +1,282 @@
+"""The command line: two runs of one command, help that helps, and one clear line for every mistake."""
+
+import dataclasses
+import importlib.metadata
+import json
+import shutil
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+
+from stad_lab.__main__ import main
+from stad_lab.agent import save_controller
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, save_autoencoder
+from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
+from stad_lab.settings import PRESETS, Settings
+
+
+@pytest.fixture
+def run(quick_run, tmp_path):
+    """A copy of the quick run that a test may damage."""
+    return shutil.copytree(quick_run, tmp_path / "run")
+
+
+def states(folder):
+    """Bytes and time of the last change of every file under a folder."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+
+
+def evaluate_quickly(folder, variant="input_output"):
+    """The arguments of a short evaluation."""
+    return ["evaluate", "--variant", variant, "--path", folder, "--fast", "--episodes", "1"]
+
+
+def train_quickly(folder, *changes, variant="input_output"):
+    """The arguments of the quick run's command."""
+    return ["train", "--variant", variant, "--settings", "quick", "--out", folder, *changes]
+
+
+def the_error(capsys, arguments):
+    """The one line that a command prints before it ends with status 2."""
+    assert main([str(argument) for argument in arguments]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+def assert_one_clear_line(process, *parts):
+    """The same for a real process."""
+    assert process.returncode == 2
+    lines = [line for line in process.stderr.splitlines() if "XDG_RUNTIME_DIR" not in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("error: ")
+    assert [part for part in parts if part not in lines[0]] == []
+
+
+def test_the_quick_run_takes_less_than_a_minute(quick_training):
+    assert quick_training[2] < 60
+
+
+def test_a_run_leaves_weights_log_and_record(quick_training):
+    folder, process, _ = quick_training
+    for stage in ("rollouts", "autoencoder", "mdn_rnn", "controller"):
+        assert f"{stage}: done" in process.stdout
+    names = ["autoencoder", "controller", "mdn_rnn"]
+    assert sorted(file.stem for file in folder.glob("*.safetensors")) == names
+    record = json.loads((folder / "record.json").read_text())
+    assert record["variant"] == "input_output"
+    assert Settings.from_dict(record["settings"]) == PRESETS["quick"]
+    assert record["seconds"].keys() == {"rollouts", "autoencoder", "mdn_rnn", "controller"}
+    assert record["made_with"]["torch"] == importlib.metadata.version("torch")
+    assert record["budget"]["random"] == {"episodes": 8, "frames": 8 * 60}
+    assert record["budget"]["agents"] == record["budget"]["evolution"]["episodes"] == 3 * 4
+    assert record["budget"]["validation"]["episodes"] == 2 * 2
+
+
+def test_the_second_run_of_a_command_does_nothing_and_says_so(run, command_line):
+    before = states(run)
+    process = command_line(*train_quickly(run))
+    assert process.returncode == 0, process.stderr
+    assert f"{run} is finished: nothing to do" in process.stdout
+    assert process.stdout.count("already there, nothing to do") == 4
+    after = states(run)
+    assert after.keys() == before.keys()
+    assert [name for name in after if after[name][0] != before[name][0]] == []
+    assert [name for name in after if after[name][1] != before[name][1]] == []
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (
+            "train",
+            ["--variant", "--settings", "--out", "--rollouts", "--until", "--set", *VARIANTS, *PRESETS, "mdn_rnn"],
+        ),
+        ("evaluate", ["--variant", "--path", "--episodes", "--first-track", "--fast", "--processes", "--json"]),
+        ("ship", ["--variant", "--path"]),
+        ("film", ["--variant", "--path", "--out", "--track", "--first", "--frames"]),
+    ],
+)
+def test_help_names_every_option(command, options, capsys):
+    with pytest.raises(SystemExit) as exit:
+        main([command, "--help"])
+    assert exit.value.code == 0
+    text = capsys.readouterr().out
+    assert [option for option in options if option not in text] == []
+
+
+def test_help_names_every_setting(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert ", ".join(field.name for field in dataclasses.fields(Settings)) in text
+
+
+def test_the_first_help_names_every_command(command_line):
+    process = command_line("--help")
+    assert process.returncode == 0
+    for command in ("train", "evaluate", "ship", "film"):
+        assert command in process.stdout
+
+
+def test_until_stops_after_a_stage_and_set_changes_a_setting(tmp_path, capsys):
+    arguments = [*train_quickly(tmp_path, variant="frame"), "--until", "rollouts", "--set", "stride=2"]
+    arguments += ["--set", "episodes=2", "--set", "crop_bar=false", "--set", "kl_weight=0.5"]
+    assert main([str(argument) for argument in arguments]) == 0
+    assert "rollouts: done" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["record.json", "rollouts"]
+    settings = json.loads((tmp_path / "record.json").read_text())["settings"]
+    changes = {"stride": 2, "episodes": 2, "crop_bar": False, "kl_weight": 0.5}
+    assert Settings.from_dict(settings) == Settings.preset("quick", **changes)
+
+
+def test_a_film_is_a_moving_picture(quick_run, tmp_path, capsys):
+    file = tmp_path / "drive.gif"
+    arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", file, "--first", 20, "--frames", 12]
+    assert main([str(argument) for argument in arguments]) == 0
+    assert f"filmed to {file}" in capsys.readouterr().out
+    with Image.open(file) as film:
+        assert film.format == "GIF"
+        pictures = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
+    assert len(pictures) == 4  # every third frame
+    assert not np.array_equal(pictures[0], pictures[-1])
+
+
+def test_an_unknown_variant_ends_in_one_clear_line(tmp_path, command_line):
+    process = command_line(*train_quickly(tmp_path / "run", variant="both"))
+    assert_one_clear_line(process, "unknown variant 'both'", "choose one of", *VARIANTS)
+    assert not (tmp_path / "run").exists()
+
+
+def test_damaged_weights_end_in_one_clear_line(run, command_line):
+    file = run / "mdn_rnn.safetensors"
+    file.write_bytes(file.read_bytes()[:1000])
+    process = command_line(*evaluate_quickly(run))
+    assert_one_clear_line(process, str(file), "is damaged", "delete it and train it: python -m stad_lab train --help")
+    assert not (run / "evaluation.json").exists()
+
+
+def test_a_run_folder_of_other_settings_ends_in_one_clear_line(run, command_line):
+    before = states(run)
+    process = command_line(*train_quickly(run, "--set", "stride=2"))
+    assert_one_clear_line(process, str(run), "stride=4", "stride=2", "choose another folder, or the same")
+    assert states(run) == before
+
+
+def test_an_unknown_preset_ends_in_one_clear_line(tmp_path, capsys):
+    error = the_error(capsys, ["train", "--variant", "input", "--settings", "fast", "--out", tmp_path / "run"])
+    assert "unknown settings 'fast': choose one of quick, laptop, paper" in error
+
+
+@pytest.mark.parametrize("options", [["--until", "end"], ["--set", "strid=2"], ["--set", "stride"]])
+def test_an_unknown_stage_or_setting_ends_in_one_clear_line(options, tmp_path, capsys):
+    error = the_error(capsys, train_quickly(tmp_path / "run", *options))
+    assert repr(options[1].split("=")[0]) in error
+    assert any(
+        remedy in error for remedy in ("choose one of rollouts", "the settings are name,", "expected NAME=VALUE")
+    )
+
+
+@pytest.mark.parametrize(
+    "change", ["stride=x", "stride=2.7", "stride=1e999", "stride=0", "crop_bar=maybe", "sigma=NaN"]
+)
+def test_a_wrong_value_of_a_setting_ends_in_one_clear_line(change, tmp_path, capsys):
+    error = the_error(capsys, train_quickly(tmp_path / "run", "--until", "rollouts", "--set", change))
+    assert change.split("=")[0] in error
+    assert change.split("=")[1].lower() in error.lower()
+    assert "expected" in error
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_missing_or_empty_run_folder_ends_in_one_clear_line(made, tmp_path, capsys):
+    folder = tmp_path / "run"
+    if made:
+        folder.mkdir()
+    error = the_error(capsys, evaluate_quickly(folder, "input"))
+    assert f"{folder} is {'empty' if made else 'not a folder'}" in error
+    assert f"expected a run made by `python -m stad_lab train --variant input --out {folder}`" in error
+
+
+def test_an_unfinished_run_ends_in_one_clear_line(run, capsys):
+    (run / "controller.safetensors").unlink()
+    error = the_error(capsys, evaluate_quickly(run))
+    assert f"{run / 'controller.safetensors'} does not exist: train it: python -m stad_lab train --help" in error
+
+
+def test_an_out_that_is_a_file_ends_in_one_clear_line(tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert str(tmp_path / "file") in the_error(capsys, train_quickly(tmp_path / "file", "--until", "rollouts"))
+
+
+@pytest.mark.parametrize("command", [evaluate_quickly, train_quickly])
+def test_a_run_of_another_variant_ends_in_one_clear_line(command, run, capsys):
+    error = the_error(capsys, command(run, variant="frame"))
+    assert str(run) in error
+    assert "'input_output'" in error
+    assert "'frame'" in error
+    assert "give its own run" in error or "choose another folder" in error
+
+
+def test_weights_of_another_variant_end_in_one_clear_line(run, capsys):
+    save_autoencoder(run / "autoencoder.safetensors", AutoEncoder("frame", 32, 8), PRESETS["quick"], [])
+    for arguments in (evaluate_quickly(run), train_quickly(run)):
+        error = the_error(capsys, arguments)
+        assert f"{run / 'autoencoder.safetensors'} holds variant 'frame', and 'input_output' was asked for" in error
+        assert "give its own run" in error
+
+
+def test_v_of_another_size_ends_in_one_clear_line(run, capsys):
+    save_autoencoder(run / "autoencoder.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
+    error = the_error(capsys, evaluate_quickly(run))
+    assert "mdn_rnn.safetensors was trained for latent_size 32, V has 16: use M and V of one run" in error
+
+
+def test_c_of_another_size_ends_in_one_clear_line(run, capsys):
+    save_controller(run / "controller.safetensors", np.zeros(867))
+    error = the_error(capsys, evaluate_quickly(run))
+    assert "(867,), expected (195,)" in error
+    assert "belongs to a V or M of another size" in error
+
+
+@pytest.mark.parametrize("part", ["autoencoder", "mdn_rnn"])
+def test_training_on_top_of_weights_of_another_size_ends_in_one_clear_line(part, run, capsys):
+    if part == "autoencoder":
+        save_autoencoder(run / f"{part}.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
+        (run / "mdn_rnn.safetensors").unlink()
+    else:
+        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 32, 5), [])
+    (run / "controller.safetensors").unlink()
+    (run / "evolution.json").unlink()
+    error = the_error(capsys, train_quickly(run))
+    assert f"{part}.safetensors" in error
+    assert "16" in error
+    assert "32" in error
+
+
+def test_weights_that_do_not_fit_their_own_header_end_in_one_clear_line(run, capsys):
+    autoencoder = AutoEncoder("input_output", 32, 8)
+    autoencoder.width = 16
+    save_autoencoder(run / "autoencoder.safetensors", autoencoder, PRESETS["quick"], [])
+    error = the_error(capsys, evaluate_quickly(run))
+    assert str(run / "autoencoder.safetensors") in error
+    assert "belong to another variant or size" in error
+
+
+def test_a_rollout_file_cut_short_ends_in_one_clear_line(run, capsys):
+    block = run / "rollouts" / "00003.frames.npy"
+    block.write_bytes(block.read_bytes()[:2000])
+    (run / "autoencoder.safetensors").unlink()
+    error = the_error(capsys, train_quickly(run))
+    assert f"{block} is damaged (2000 bytes, and not the checksum in the manifest): delete" in error
+    assert "collect again" in error
+
+
+@pytest.mark.parametrize("options", [["--episodes", "0"], ["--first-track", "-5"], ["--processes", "0"]])
+def test_a_wrong_number_ends_in_one_clear_line(options, run, capsys):
+    error = the_error(capsys, [*evaluate_quickly(run), *options])
+    assert f"{options[0].strip('-').replace('-', '_')}={options[1]}" in error
+    assert "expected" in error

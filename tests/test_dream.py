@@ -1,0 +1,132 @@
+"""The dream is a Gymnasium environment that repeats itself for a seed and shows pictures."""
+
+import warnings
+
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from stad_lab.dream import DreamEnv, dream_on
+
+ACTION = np.array([0.1, 0.5, 0], np.float32)
+
+
+@pytest.fixture
+def dream(agent):
+    """A dream of the quick run."""
+    return DreamEnv(agent.autoencoder, agent.mdn_rnn, max_frames=20, render_mode="rgb_array")
+
+
+def dream_along(env, seed, frames=10, **options):
+    """The latents of one dream under a constant action, (frames + 1, latent_size)."""
+    latents = [env.reset(seed=seed, options=options)[0]]
+    latents += [env.step(ACTION)[0] for _ in range(frames)]
+    return np.array(latents)
+
+
+def test_check_env_passes(dream):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # z has no bounds, and no spec was registered
+        check_env(dream)
+
+
+def test_the_same_seed_gives_the_same_dream_and_another_seed_another_one(dream):
+    first = dream_along(dream, seed=1)
+    assert np.array_equal(dream_along(dream, seed=1), first)
+    assert not np.isclose(dream_along(dream, seed=2), first).any(axis=1).all()
+    assert np.isfinite(first).all()
+
+
+def test_the_action_steers_the_dream(dream):
+    straight = dream_along(dream, seed=1)
+    dream.reset(seed=1)
+    turned = [dream.step(np.array([-1, 0, 1], np.float32))[0] for _ in range(10)]
+    assert not np.allclose(straight[1:], turned, atol=1e-4)
+
+
+def test_a_colder_dream_is_calmer(dream):
+    calm = []
+    for temperature in (0.01, 1.0):
+        dream.temperature = temperature
+        steps = dream_along(dream, seed=3, frames=19, latents=np.zeros(32, np.float32))
+        calm.append(np.abs(np.diff(steps[1:], axis=0)).mean())
+    assert calm[0] < 0.5 * calm[1]
+
+
+def test_a_dream_is_cut_after_max_frames_and_never_rewarded(dream):
+    dream.reset(seed=0)
+    steps = [dream.step(ACTION) for _ in range(20)]
+    assert [step[1:4] for step in steps] == [(0.0, False, False)] * 19 + [(0.0, False, True)]
+
+
+def test_a_dream_shows_pictures_of_its_latents(dream):
+    dream.reset(seed=0, options={"latents": np.zeros(32, np.float32)})
+    first = dream.render()
+    assert first.shape == (64, 64, 3)
+    assert first.dtype == np.uint8
+    dream.reset(seed=5, options={"latents": np.zeros(32, np.float32)})
+    assert np.array_equal(dream.render(), first)
+    dream.step(ACTION)
+    assert not np.array_equal(dream.render(), first)
+    dream.render_mode = None
+    assert dream.render() is None
+
+
+def test_a_dream_shows_the_memory_of_m(dream, agent):
+    _, info = dream.reset(seed=0)
+    assert info["hidden"].shape == (agent.mdn_rnn.hidden_size,)
+    assert not info["hidden"].any()
+    assert dream.step(ACTION)[4]["hidden"].any()
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]]])
+def test_an_action_that_is_not_three_finite_numbers_is_refused(action, dream):
+    dream.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action \[.*\]: expected three finite numbers, steering, gas and brake"):
+        dream.step(np.array(action, np.float32))
+
+
+def test_latents_that_do_not_fit_are_refused(dream):
+    with pytest.raises(ValueError, match=r"latents of shape \(5,\): expected \(32,\) finite numbers"):
+        dream.reset(options={"latents": np.zeros(5)})
+    with pytest.raises(ValueError, match=r"expected \(32,\) finite numbers"):
+        dream.reset(options={"latents": np.full(32, np.nan)})
+
+
+@pytest.mark.parametrize("temperature", [0, -1, float("nan")])
+def test_a_temperature_that_is_no_positive_number_is_refused(temperature, agent):
+    with pytest.raises(ValueError, match=f"temperature={temperature}: expected a .*number above 0"):
+        DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature)
+
+
+def test_another_render_mode_is_refused(agent):
+    with pytest.raises(ValueError, match="render_mode='human': a dream can be rendered as 'rgb_array' only"):
+        DreamEnv(agent.autoencoder, agent.mdn_rnn, render_mode="human")
+
+
+def test_a_step_before_reset_is_refused(dream):
+    with pytest.raises(RuntimeError, match="step before reset: call reset"):
+        dream.step(ACTION)
+
+
+def test_an_agent_dreams_on_without_being_changed(agent, observations):
+    for observation in observations[:10]:
+        agent.act(observation)
+    before = [part.clone() for part in agent.state], agent.latents.copy()
+    pictures, actions = dream_on(agent, 12, temperature=0.8, seed=3)
+    assert pictures.shape == (12, 64, 64, 3)
+    assert pictures.dtype == np.uint8
+    assert actions.shape == (12, 3)
+    assert actions.dtype == np.float32
+    assert len({picture.tobytes() for picture in pictures}) == 12  # something moves
+    assert all((was == now).all() for was, now in zip(before[0], agent.state, strict=True))
+    assert np.array_equal(before[1], agent.latents)
+    again = dream_on(agent, 12, temperature=0.8, seed=3)
+    assert np.array_equal(again[0], pictures)
+    assert np.array_equal(again[1], actions)
+    assert not np.array_equal(dream_on(agent, 12, temperature=0.8, seed=4)[0], pictures)
+
+
+def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
+    with pytest.raises(ValueError, match="has not acted yet: let it drive a few real frames, then dream on"):
+        dream_on(agent, 5)

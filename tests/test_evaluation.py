@@ -1,0 +1,98 @@
+"""Evaluation: official tracks, every episode on record, numbers that a script of one's own finds again."""
+
+import json
+
+import gymnasium
+import numpy as np
+import pytest
+
+from stad_lab import load_agent
+from stad_lab.evaluation import describe, evaluate, summarise
+from stad_lab.rollouts import TRACK_RANGES
+
+TRACK = 3
+
+
+@pytest.fixture(scope="module")
+def official(quick_run):
+    """One whole episode with Gymnasium's own renderer."""
+    return evaluate("input_output", quick_run, episodes=1, first_track=TRACK, processes=1)
+
+
+@pytest.fixture(scope="module")
+def fast(quick_run):
+    """Five whole episodes with the fast renderer."""
+    return evaluate("input_output", quick_run, episodes=5, first_track=10, fast=True)
+
+
+def test_a_script_with_gymnasium_alone_finds_the_same_return(official, quick_run):
+    env = gymnasium.make("CarRacing-v3")
+    agent = load_agent("input_output", quick_run)
+    observation, _ = env.reset(seed=TRACK)
+    agent.reset()
+    total = frames = 0
+    ended = False
+    while not ended:
+        observation, reward, terminated, truncated, _ = env.step(agent.act(observation))
+        total, frames, ended = total + reward, frames + 1, terminated or truncated
+    assert official["renderer"] == "official"
+    assert official["episodes"] == [{"track": TRACK, "return": pytest.approx(total, abs=1e-6), "frames": frames}]
+
+
+def test_every_episode_is_on_record(fast):
+    assert [episode["track"] for episode in fast["episodes"]] == [10, 11, 12, 13, 14]
+    returns = np.array([episode["return"] for episode in fast["episodes"]])
+    assert len(set(returns)) > 1
+    assert {name: fast[name] for name in summarise(returns)} == summarise(returns)
+    for episode in fast["episodes"]:
+        assert 0 < episode["frames"] <= 1000
+    assert (fast["variant"], fast["renderer"]) == ("input_output", "fast")
+
+
+def test_an_evaluation_goes_to_the_screen_and_to_a_file(quick_run, fast, tmp_path, command_line):
+    arguments = ["evaluate", "--variant", "input_output", "--path", quick_run, "--fast", "--episodes", 5]
+    process = command_line(*arguments, "--first-track", 10, "--processes", 1, "--json", tmp_path / "result.json")
+    assert process.returncode == 0, process.stderr
+    assert json.loads((tmp_path / "result.json").read_text()) == fast  # one process or two: the same numbers
+    assert describe(fast) in process.stdout
+    assert str(tmp_path / "result.json") in process.stdout
+
+
+def test_the_screen_shows_what_the_summary_says(fast):
+    text = describe(fast)
+    for number in (fast["mean"], fast["standard_deviation"], *fast["interval"]):
+        assert f"{number:.1f}" in text
+    assert "5 episodes (tracks 10 to 14, fast renderer)" in text
+    assert "% of the episodes above 900" in text
+
+
+def test_the_summary_of_a_few_returns_by_hand():
+    result = summarise(np.array([800.0, 900.0, 1000.0]))
+    assert result["mean"] == 900
+    assert result["standard_deviation"] == pytest.approx(100)  # of the sample: divided by n - 1
+    assert result["above_900"] == pytest.approx(1 / 3)  # 900 itself is not above
+    low, high = result["interval"]
+    assert 800 <= low < 900 < high <= 1000
+
+
+def test_the_interval_is_that_of_the_mean():
+    returns = np.random.default_rng(0).normal(500, 100, 400)
+    error = 1.96 * returns.std(ddof=1) / 20
+    assert summarise(returns)["interval"] == pytest.approx([returns.mean() - error, returns.mean() + error], abs=1)
+    assert summarise(np.full(7, 321.0))["interval"] == [321, 321]
+
+
+def test_one_episode_has_no_deviation():
+    assert summarise(np.array([12.5])) == {
+        "mean": 12.5,
+        "standard_deviation": 0.0,
+        "interval": [12.5, 12.5],
+        "above_900": 0.0,
+    }
+
+
+@pytest.mark.parametrize(("first", "episodes"), [(-1, 1), (TRACK_RANGES["test"][1], 1), (999_950, 100), (0, 0)])
+def test_tracks_outside_the_test_range_are_refused(first, episodes, quick_run):
+    message = f"episodes={episodes} from first_track={first}: expected at least 1 episode, on tracks 0 to 999999"
+    with pytest.raises(ValueError, match=message):
+        evaluate("input_output", quick_run, episodes, first)

@@ -1,0 +1,206 @@
+"""CMA-ES over C: a log of every generation, and an interrupt that changes nothing."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import zlib
+
+import numpy as np
+import pytest
+
+from stad_lab.agent import load_controller
+from stad_lab.controller import initial_parameters
+from stad_lab.evolution import evolve, fitness_curves, make_strategy, replay
+from stad_lab.rollouts import TRACK_RANGES
+from stad_lab.settings import Settings
+
+GENERATIONS = 6
+
+
+def settings(**changes):
+    """Those of the quick run, with more generations."""
+    return Settings.preset("quick", **({"generations": GENERATIONS} | changes))
+
+
+def without_evolution(run, folder):
+    """A copy of a run whose controller is not evolved yet."""
+    return shutil.copytree(run, folder, ignore=shutil.ignore_patterns("evolution.json", "controller.safetensors"))
+
+
+def read(folder):
+    """The log in a folder."""
+    return json.loads((folder / "evolution.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def one_go(quick_run, tmp_path_factory):
+    """An evolution in one piece, in one process."""
+    folder = without_evolution(quick_run, tmp_path_factory.mktemp("evolution") / "one_go")
+    assert evolve("input_output", settings(processes=1), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first_part(quick_run, tmp_path_factory):
+    """The first two generations, in two processes."""
+    folder = without_evolution(quick_run, tmp_path_factory.mktemp("evolution") / "first_part")
+    assert evolve("input_output", settings(processes=2, generations=2), folder)
+    return folder
+
+
+def test_the_fitnesses_are_the_same_for_one_and_two_processes(one_go, first_part):
+    assert len(read(first_part)["generations"]) == 2
+    assert read(first_part)["generations"] == read(one_go)["generations"][:2]
+
+
+def test_an_evolution_in_two_parts_equals_one_in_one_go(one_go, first_part, tmp_path):
+    folder = shutil.copytree(first_part, tmp_path / "run")
+    assert evolve("input_output", settings(processes=1), folder)
+    assert read(folder) == read(one_go)
+    assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
+
+
+def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, quick_run, tmp_path):
+    folder = without_evolution(quick_run, tmp_path / "run")
+    command = [sys.executable, "-m", "stad_lab", "train", "--variant", "input_output", "--settings", "quick"]
+    command += ["--out", folder, "--set", f"generations={GENERATIONS}", "--set", "processes=1"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    deadline = time.time() + 120
+    while not (folder / "evolution.json").exists():
+        assert time.time() < deadline
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    error = process.communicate(timeout=60)[1]
+    assert process.returncode == 130
+    assert "stopped; the same command goes on from here" in error
+    assert "Traceback" not in error
+    assert 1 <= len(read(folder)["generations"]) < GENERATIONS  # it was in the middle
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    assert read(folder) == read(one_go)
+    assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
+
+
+def test_a_complete_evolution_is_left_alone(one_go):
+    before = {path: path.stat().st_mtime_ns for path in one_go.iterdir()}
+    assert not evolve("input_output", settings(processes=1), one_go)
+    assert {path: path.stat().st_mtime_ns for path in one_go.iterdir()} == before
+
+
+def test_every_generation_logs_worst_average_and_best(one_go):
+    generations = read(one_go)["generations"]
+    assert [entry["generation"] for entry in generations] == list(range(1, GENERATIONS + 1))
+    curves = fitness_curves(generations)
+    assert curves.shape == (3, GENERATIONS)
+    for entry, (worst, average, best) in zip(generations, curves.T, strict=True):
+        fitness = [sum(returns) / len(returns) for returns in entry["returns"]]
+        assert len(fitness) == settings().population
+        assert (worst, average, best) == pytest.approx((min(fitness), sum(fitness) / len(fitness), max(fitness)))
+        assert all(TRACK_RANGES["evolve"][0] <= track < TRACK_RANGES["evolve"][1] for track in entry["tracks"])
+        assert 0 < entry["frames"] <= 60 * settings().population
+    assert len({entry["tracks"][0] for entry in generations}) == GENERATIONS  # new tracks every time
+    assert (curves[0] < curves[2]).any()
+
+
+def test_worst_average_and_best_of_agents_on_several_tracks():
+    generations = [{"returns": [[1, 3], [10, 20], [-5, 5]]}, {"returns": [[7, 7], [9, 7], [8, 8]]}]
+    assert fitness_curves(generations).tolist() == [[0, 7], [17 / 3, 23 / 3], [15, 8]]
+
+
+def test_the_controller_is_the_mean_that_drove_the_validation_tracks_best(one_go):
+    log = read(one_go)
+    looks = {entry["generation"]: entry["validation"]["mean"] for entry in log["generations"] if "validation" in entry}
+    assert list(looks) == [2, 4, 6]
+    assert log["best"] == {"generation": max(looks, key=looks.get), "validation": max(looks.values())}
+    start = initial_parameters(32, 32, settings().initial_gas)
+    best = replay(start, settings(), log["generations"][: log["best"]["generation"]])
+    assert np.array_equal(load_controller(one_go / "controller.safetensors"), best.mean)
+
+
+def test_a_replay_restores_the_full_state():
+    start = initial_parameters(4, 4)
+    strategy, log = make_strategy(start, settings()), []
+    for _ in range(12):
+        population = strategy.ask()
+        returns = [[-float((agent**2).sum()), -float(((agent - 1) ** 2).sum())] for agent in population]
+        strategy.tell(population, [-np.mean(pair) for pair in returns])
+        replayed = replay(start, settings(), log)
+        following = replayed.ask()
+        assert np.array_equal(following, population)  # the next population, to the last bit
+        log.append({"returns": returns, "mean_checksum": zlib.crc32(strategy.mean.tobytes())})
+    replayed = replay(start, settings(), json.loads(json.dumps(log)))
+    assert strategy.countiter == replayed.countiter == 12
+    assert strategy.sigma == replayed.sigma != settings().sigma
+    for state in (lambda s: s.mean, lambda s: s.C, lambda s: s.pc, lambda s: s.adapt_sigma.ps):
+        assert np.array_equal(state(strategy), state(replayed))
+        assert np.any(state(strategy))
+    for _ in range(3):
+        population = strategy.ask()
+        assert np.array_equal(population, replayed.ask())
+        for one in (strategy, replayed):
+            one.tell(population, [float((agent**2).sum()) for agent in population])
+
+
+def test_another_seed_evolves_otherwise():
+    populations = [make_strategy(np.zeros(8), settings(seed=seed)).ask() for seed in (0, 0, 1)]
+    assert np.array_equal(populations[0], populations[1])
+    assert not np.array_equal(populations[0], populations[2])
+
+
+def test_numpy_s_global_random_state_is_untouched_and_untouching():
+    def best_of_five():
+        strategy = make_strategy(np.ones(8), settings())
+        for _ in range(5):
+            population = strategy.ask()
+            strategy.tell(population, [float((agent**2).sum()) for agent in population])
+        return strategy.mean
+
+    np.random.seed(1)  # noqa: NPY002
+    state = np.random.get_state()[1].tolist()  # noqa: NPY002
+    first = best_of_five()
+    assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
+    np.random.seed(2)  # noqa: NPY002
+    assert np.array_equal(best_of_five(), first)
+
+
+def test_a_log_that_was_changed_is_refused(first_part, tmp_path):
+    folder = shutil.copytree(first_part, tmp_path / "run")
+    log = read(folder)
+    returns = log["generations"][0]["returns"]
+    returns[int(np.argmin(returns))] = [1000.0]
+    (folder / "evolution.json").write_text(json.dumps(log))
+    with pytest.raises(
+        ValueError, match=r"another mean in generation 1 than the run had: .*changed.*Start in a new folder"
+    ):
+        evolve("input_output", settings(), folder)
+    assert read(folder) == log
+
+
+def test_a_damaged_log_is_refused(first_part, tmp_path):
+    folder = shutil.copytree(first_part, tmp_path / "run")
+    log = folder / "evolution.json"
+    log.write_text(log.read_text()[:-200])
+    with pytest.raises(ValueError, match=r"evolution.json is damaged .*: delete it"):
+        evolve("input_output", settings(), folder)
+
+
+def test_a_log_of_other_settings_is_refused(first_part):
+    with pytest.raises(ValueError, match=r"holds a run with sigma=0.1, and now sigma=0.2 is asked for: choose another"):
+        evolve("input_output", settings(sigma=0.2), first_part)
+
+
+def test_a_deleted_controller_is_made_again(one_go, tmp_path):
+    folder = shutil.copytree(one_go, tmp_path / "run")
+    (folder / "controller.safetensors").unlink()
+    evolve("input_output", settings(), folder)
+    assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
+
+
+def test_a_damaged_controller_is_not_taken_for_a_finished_run(one_go, tmp_path):
+    folder = shutil.copytree(one_go, tmp_path / "run")
+    file = folder / "controller.safetensors"
+    file.write_bytes(file.read_bytes()[:-10])
+    with pytest.raises(ValueError, match=r"controller.safetensors is damaged"):
+        evolve("input_output", settings(), folder)

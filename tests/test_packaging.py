@@ -1,0 +1,114 @@
+"""The house: requirements that agree, clean code, documented names, imports that run downward, no hidden code."""
+
+import ast
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "stad_lab"
+ROOMS = [
+    "settings",
+    "car_racing",
+    "frames",
+    "checkpoints",
+    "parallel",
+    "training",
+    "rollouts",
+    "autoencoder",
+    "mdn_rnn",
+    "controller",
+    "agent",
+    "dream",
+    "evolution",
+    "evaluation",
+    "pipeline",
+    "plots",
+    "film",
+    "widgets",
+    "__main__",
+]
+FILES = sorted(PACKAGE.glob("*.py"))
+
+
+def parse(file):
+    """The syntax tree of a file."""
+    return ast.parse(file.read_text(), str(file))
+
+
+def test_environment_txt_and_pyproject_agree():
+    lines = [line.split("#")[0].strip() for line in (ROOT / "environment.txt").read_text().splitlines()]
+    requirements = [line for line in lines if line]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert requirements[-1] == "-e ."
+    assert sorted(requirements[:-1]) == sorted(project["dependencies"])
+
+
+def test_every_requirement_is_bounded_and_box2d_py_is_not_among_them():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for requirement in project["dependencies"]:
+        assert "==" in requirement or "<" in requirement
+        assert not requirement.startswith("box2d")
+    assert "torch==2.13.0" in project["dependencies"]
+
+
+def test_the_installed_versions_are_the_required_ones():
+    process = subprocess.run([sys.executable, "-m", "pip", "check"], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stdout
+
+
+@pytest.mark.parametrize("command", [["check"], ["format", "--check"]])
+def test_ruff_is_clean(command):
+    process = subprocess.run([sys.executable, "-m", "ruff", *command, ROOT], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stdout + process.stderr
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_every_public_name_has_a_docstring(file):
+    tree = parse(file)
+    assert ast.get_docstring(tree)
+    kinds = (ast.FunctionDef, ast.ClassDef)
+    public = [node for node in tree.body if isinstance(node, kinds)]
+    public += [
+        node for owner in public for node in owner.body if isinstance(owner, ast.ClassDef) and isinstance(node, kinds)
+    ]
+    undocumented = [node.name for node in public if node.name[0] != "_" and not ast.get_docstring(node)]
+    assert undocumented == []
+
+
+def test_every_file_is_a_room():
+    assert {file.stem for file in FILES} - {"__init__"} <= set(ROOMS)
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if file.stem != "__init__"], ids=lambda file: file.stem)
+def test_imports_run_downward_only(file):
+    imported = set()
+    for node in ast.walk(parse(file)):
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "relative import"
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        else:
+            continue
+        imported |= {name.split(".")[1] if "." in name else name for name in names if name.split(".")[0] == "stad_lab"}
+    above = set(ROOMS[: ROOMS.index(file.stem)])
+    assert imported <= above
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_nothing_that_is_read_can_run_code(file):
+    for node in ast.walk(parse(file)):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            assert called not in ("eval", "exec", "compile", "__import__", "torch.load", "os.system")
+            keywords = {keyword.arg: ast.unparse(keyword.value) for keyword in node.keywords}
+            assert keywords.get("shell", "False") == "False"
+            if called == "np.load":
+                assert keywords["allow_pickle"] == "False"
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            modules = [alias.name for alias in node.names] + [getattr(node, "module", None)]
+            assert not {"pickle", "dill", "joblib", "shelve", "marshal"} & set(modules)

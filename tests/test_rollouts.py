@@ -1,0 +1,212 @@
+"""The random driver's dataset: complete, checked, memory-mapped, and the same after any interrupt."""
+
+import hashlib
+import itertools
+import json
+import mmap
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from stad_lab.frames import difference_image, episode_differences
+from stad_lab.rollouts import TRACK_RANGES, RandomDriver, Rollouts, collect_rollouts, drive_randomly, track_seeds
+from stad_lab.settings import Settings
+
+MANY = {"episodes": 24, "episode_frames": 30}
+
+
+@pytest.fixture(scope="module")
+def one_go(tmp_path_factory):
+    """Many short episodes, collected by one process without interruption."""
+    folder = tmp_path_factory.mktemp("rollouts") / "one_go"
+    assert collect_rollouts(Settings.preset("quick", **MANY, processes=1), folder)
+    return folder
+
+
+@pytest.fixture
+def copied(quick_run, tmp_path):
+    """A dataset that a test may damage."""
+    return shutil.copytree(quick_run / "rollouts", tmp_path / "rollouts")
+
+
+def contents(folder):
+    """The bytes of every file in a folder by its name; a killed process may leave hidden half-written files."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith(".")}
+
+
+def collect_command(folder):
+    """The command that collects the same episodes as `one_go`, with two processes."""
+    command = [sys.executable, "-m", "stad_lab", "train", "--variant", "frame", "--settings", "quick"]
+    command += ["--until", "rollouts", "--out", folder]
+    for name, value in MANY.items():
+        command += ["--set", f"{name}={value}"]
+    return command
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(how, one_go, tmp_path):
+    manifest = tmp_path / "run" / "rollouts" / "manifest.json"
+    process = subprocess.Popen(collect_command(tmp_path / "run"), stderr=subprocess.PIPE, text=True)
+    deadline = time.time() + 120
+    while not manifest.exists() or len(json.loads(manifest.read_text())["blocks"]) < 3:
+        assert time.time() < deadline
+        time.sleep(0.005)
+    process.send_signal(how)
+    error = process.communicate(timeout=60)[1]
+    if how == signal.SIGINT:
+        assert process.returncode == 130
+        assert "the same command goes on" in error
+        assert "Traceback" not in error
+    done = json.loads(manifest.read_text())["blocks"]
+    assert 3 <= len(done) < MANY["episodes"]  # it was in the middle
+    before = {path.name: path.stat().st_mtime_ns for path in manifest.parent.iterdir()}
+    subprocess.run(collect_command(tmp_path / "run"), check=True, capture_output=True, timeout=120)
+    for entry in done:  # not collected again
+        for name in (f"{entry['index']:05d}.frames.npy", f"{entry['index']:05d}.actions.npy"):
+            assert (manifest.parent / name).stat().st_mtime_ns == before[name]
+    assert contents(manifest.parent) == contents(one_go)
+    assert len(json.loads(manifest.read_text())["blocks"]) == MANY["episodes"]
+
+
+def test_a_complete_collection_is_left_alone(copied):
+    before = contents(copied)
+    assert not collect_rollouts(Settings.preset("quick"), copied)
+    assert contents(copied) == before
+
+
+def test_the_manifest_tells_settings_seeds_counts_and_checksums(quick_run):
+    folder = quick_run / "rollouts"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    settings = Settings.preset("quick")
+    assert {name: getattr(settings, name) for name in manifest["settings"]} == manifest["settings"]
+    assert [entry["index"] for entry in manifest["blocks"]] == list(range(settings.episodes))
+    for entry in manifest["blocks"]:
+        assert TRACK_RANGES["collect"][0] <= entry["track"] < TRACK_RANGES["collect"][1]
+        for name in ("frames", "actions"):
+            file = folder / f"{entry['index']:05d}.{name}.npy"
+            assert len(np.load(file)) == entry["frames"]
+            assert hashlib.sha256(file.read_bytes()).hexdigest() == entry[f"{name}_sha256"]
+
+
+def test_a_block_can_be_driven_again(quick_run):
+    rollouts = Rollouts(quick_run / "rollouts")
+    frames, actions, track = drive_randomly(Settings.preset("quick"), 3)
+    assert np.array_equal(frames, rollouts.frames[3])
+    assert np.array_equal(actions, rollouts.actions[3])
+    assert track == rollouts.manifest["blocks"][3]["track"]
+
+
+def test_frames_are_memory_mapped_uint8(quick_run):
+    rollouts = Rollouts(quick_run / "rollouts")
+    for frames, actions in zip(rollouts.frames, rollouts.actions, strict=True):
+        assert frames.dtype == np.uint8
+        assert frames.shape[1:] == (64, 64, 3)
+        assert actions.dtype == np.float32
+        assert actions.shape == (len(frames), 3)
+        owner = frames
+        while isinstance(owner, np.ndarray):
+            owner = owner.base
+        assert isinstance(owner, mmap.mmap)
+        assert not frames.flags.writeable
+
+
+def test_pairs_are_the_frames_of_the_difference_images(quick_run):
+    rollouts = Rollouts(quick_run / "rollouts")
+    assert len(rollouts) == sum(len(frames) for frames in rollouts.frames)
+    frames, earlier = rollouts.pairs(np.arange(len(rollouts)), stride=4)
+    expected = np.concatenate([episode_differences(frames, 4) for frames in rollouts.frames])
+    assert np.array_equal(frames, np.concatenate(rollouts.frames))
+    assert np.array_equal(difference_image(frames, earlier), expected)
+
+
+def test_whole_episodes_are_held_out(quick_run):
+    rollouts = Rollouts(quick_run / "rollouts")
+    training, heldout = rollouts.split()
+    assert sorted([*training, *heldout]) == list(range(len(rollouts)))
+    assert len(training) > len(heldout) > 0
+    assert not set(rollouts.episode[training]) & set(rollouts.episode[heldout])
+
+
+def test_the_four_uses_share_no_track():
+    ranges = sorted(TRACK_RANGES.values())
+    assert all(before[1] <= after[0] for before, after in itertools.pairwise(ranges))
+    for use, (low, high) in TRACK_RANGES.items():
+        assert all(low <= track < high for track in track_seeds(use, 1000, 0))
+    assert track_seeds("evolve", 4, 0, 1) != track_seeds("evolve", 4, 0, 2) != track_seeds("evolve", 4, 1, 2)
+
+
+def test_the_random_driver_gives_smooth_actions_within_bounds():
+    driver = RandomDriver(np.random.default_rng(0))
+    actions = np.array([driver.act() for _ in range(5000)])
+    assert actions.dtype == np.float32
+    assert (actions >= [-1, 0, 0]).all()
+    assert (actions <= 1).all()
+    assert abs(actions[:, 0].mean()) < 0.1  # turns to both sides
+    assert np.abs(np.diff(actions[:, 0])).mean() < 0.5 * actions[:, 0].std()
+    assert 0 < (actions[:, 2] > 0).mean() < 0.3  # brakes, rarely
+    assert not ((actions[:, 1] > 0) & (actions[:, 2] > 0)).any()
+
+
+def test_most_episodes_start_on_their_way():
+    moving = Settings.preset("quick", random_starts=1.0, episode_frames=25)
+    at_rest = Settings.preset("quick", random_starts=0.0, episode_frames=25)
+    for index in range(2):
+        zoomed_out, close = drive_randomly(at_rest, index)[0][0], drive_randomly(moving, index)[0][0]
+        assert (zoomed_out == 0).mean() > 0.2 > (close == 0).mean()  # the opening zoom shows the dark outside
+
+
+@pytest.mark.parametrize("name", ["00002.frames.npy", "00005.actions.npy"])
+def test_a_missing_block_is_an_error_that_names_it(name, copied):
+    (copied / name).unlink()
+    with pytest.raises(FileNotFoundError, match=f"{name} is missing although the manifest lists it: delete .* again"):
+        Rollouts(copied)
+
+
+def test_a_block_cut_short_is_an_error_that_names_it(copied):
+    block = copied / "00002.frames.npy"
+    block.write_bytes(block.read_bytes()[:5000])
+    with pytest.raises(
+        ValueError, match=r"00002.frames.npy is damaged \(5000 bytes.*checksum.*delete .* collect again"
+    ):
+        Rollouts(copied)
+
+
+def test_one_flipped_bit_is_an_error_that_names_the_block(copied):
+    block = copied / "00004.frames.npy"
+    content = bytearray(block.read_bytes())
+    content[-1] ^= 1
+    block.write_bytes(content)
+    with pytest.raises(ValueError, match=r"00004.frames.npy is damaged.*delete .* collect again"):
+        Rollouts(copied)
+
+
+def test_a_damaged_manifest_is_an_error_that_names_it(copied):
+    manifest = copied / "manifest.json"
+    manifest.write_text(manifest.read_text()[:100])
+    with pytest.raises(ValueError, match=r"manifest.json is damaged.*delete it and collect"):
+        Rollouts(copied)
+
+
+def test_a_folder_without_rollouts_is_an_error_that_names_the_command(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"manifest.json does not exist.*collect the rollouts first: python -m"):
+        Rollouts(tmp_path / "nowhere")
+
+
+def test_rollouts_of_other_settings_are_refused(copied):
+    before = contents(copied)
+    with pytest.raises(ValueError, match=r"'episodes': 8.*'episodes': 9.*choose another folder or the same settings"):
+        collect_rollouts(Settings.preset("quick", episodes=9), copied)
+    assert contents(copied) == before
+
+
+def test_an_unfinished_collection_is_not_taken_for_a_dataset(copied):
+    manifest = json.loads((copied / "manifest.json").read_text())
+    manifest["blocks"] = []
+    (copied / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(ValueError, match=r"\b0\b.*\b8\b.*collect"):
+        Rollouts(copied)
