@@ -16,7 +16,6 @@ from stad_lab.parallel import make_executor
 from stad_lab.rollouts import TRACK_RANGES
 
 SOLVED = 900  # CarRacing counts as solved at a mean return of 900 over 100 tracks
-GROUP = 4  # cars in step: small groups, because Gymnasium's renderer is slow and a progress bar should move
 
 
 def evaluate(
@@ -54,15 +53,11 @@ def evaluate(
     agent = load_agent(variant, path)
     folder = PRETRAINED / variant if path is None else Path(path)
     tracks = list(range(first_track, first_track + episodes))
-    groups = [tracks[start : start + GROUP] for start in range(0, episodes, GROUP)]
     executor = make_executor(processes)
     try:
-        futures = [executor.submit(drive_group, folder, variant, agent.parameters, g, fast, None) for g in groups]
-        results = []
-        with tqdm(total=episodes, desc=f"evaluate ({variant})", unit="episode") as progress:
-            for future in futures:
-                results.append(future.result())
-                progress.update(len(results[-1][0]))
+        # One car at a time: in a batch the last bits differ, and a script that drives alone should get these numbers.
+        futures = [executor.submit(drive_group, folder, variant, agent.parameters, [t], fast, None) for t in tracks]
+        results = [future.result() for future in tqdm(futures, f"evaluate ({variant})", unit="episode")]
     finally:
         executor.shutdown(cancel_futures=True)
     returns, frames = (np.concatenate(part) for part in zip(*results, strict=True))

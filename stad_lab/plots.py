@@ -153,7 +153,7 @@ def plot_search(landscape, generations: list[dict], shown: list[int], reach: flo
         shown: indices of the generations to draw, one panel each.
         reach: the panels show [-reach, reach] in both variables.
     """
-    figure, axes = new_figure(2.6 * len(shown) + 0.4, 3.1, 1, len(shown), sharex=True, sharey=True)
+    figure, axes = new_figure(2.5 * len(shown) + 0.5, 3.5, 1, len(shown), sharex=True, sharey=True)
     x = np.linspace(-reach, reach, 121)
     height = landscape(np.stack(np.meshgrid(x, x), axis=-1))
     for index, axis in zip(shown, axes[0], strict=True):

@@ -1,0 +1,78 @@
+"""What comes with stad_lab: every shipped part loads, drives, and is described by its own record."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stad_lab.agent import PRETRAINED, drive, load_agent
+from stad_lab.autoencoder import VARIANTS, load_autoencoder
+from stad_lab.checkpoints import checksum
+from stad_lab.evaluation import summarise
+from stad_lab.evolution import fitness_curves
+from stad_lab.rollouts import TRACK_RANGES, track_seeds
+from stad_lab.settings import Settings
+
+AGENTS = sorted(file.parent.name for file in PRETRAINED.glob("*/controller.safetensors"))
+README = Path(__file__).parent.parent / "README.md"
+
+
+def read(variant, name):
+    return json.loads((PRETRAINED / variant / name).read_text())
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_v_of_every_variant_is_shipped_with_its_record(variant):
+    _, facts = load_autoencoder(PRETRAINED / variant / "autoencoder.safetensors", variant)
+    record = read(variant, "record.json")
+    settings = Settings.from_dict(record["settings"])
+    assert record["variant"] == variant and settings.name == "laptop"
+    assert (facts["stride"], facts["latent_size"], facts["width"]) == (
+        settings.stride,
+        settings.latent_size,
+        settings.width,
+    )
+    assert facts["history"][-1]["step"] == settings.v_steps
+    assert record["made_with"]["commit"] and not record["made_with"]["uncommitted_changes"]
+
+
+def test_the_agent_of_the_variant_input_is_shipped():
+    assert "input" in AGENTS
+
+
+@pytest.mark.parametrize("variant", AGENTS)
+def test_a_shipped_evaluation_belongs_to_the_shipped_controller_and_to_unseen_tracks(variant):
+    result = read(variant, "evaluation.json")
+    returns = np.array([episode["return"] for episode in result["episodes"]])
+    assert result["controller_sha256"] == checksum(PRETRAINED / variant / "controller.safetensors")
+    assert result["renderer"] == "official" and len(returns) == 100
+    assert summarise(returns).items() <= result.items()
+    low, high = TRACK_RANGES["test"]
+    assert all(low <= episode["track"] < high for episode in result["episodes"])
+
+
+@pytest.mark.parametrize("variant", AGENTS)
+def test_a_shipped_log_holds_every_generation_and_the_best_mean(variant):
+    log, record = read(variant, "evolution.json"), read(variant, "record.json")
+    settings = Settings.from_dict(record["settings"])
+    assert fitness_curves(log["generations"]).shape == (3, settings.generations)
+    looks = {entry["generation"]: entry["validation"]["mean"] for entry in log["generations"] if "validation" in entry}
+    assert log["best"] == {"generation": max(looks, key=looks.get), "validation": max(looks.values())}
+    assert record["budget"]["agents"] == settings.generations * settings.population
+
+
+@pytest.mark.parametrize("variant", AGENTS)
+def test_a_shipped_agent_drives(variant):
+    returns, _ = drive(load_agent(variant), track_seeds("test", 4, 7))
+    assert returns.mean() > 600  # driving straight on, or on grass, earns less than 100
+
+
+@pytest.mark.parametrize("variant", AGENTS)
+def test_the_readme_reports_the_shipped_evaluation(variant):
+    result = read(variant, "evaluation.json")
+    row = re.search(rf"^\| `{variant}` .*$", README.read_text(), re.M).group()
+    low, high = result["interval"]
+    for figure in (f"{result['mean']:.1f}", f"{result['standard_deviation']:.1f}", f"{low:.1f} to {high:.1f}"):
+        assert figure in row
