@@ -49,7 +49,8 @@ def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
     """
     weights = parameters[..., :-ACTION_SIZE].reshape(-1, ACTION_SIZE, features.shape[1])
     bias = parameters[..., -ACTION_SIZE:].reshape(-1, ACTION_SIZE)
-    raw = (weights * features[:, None]).sum(-1) + bias
+    with np.errstate(invalid="ignore"):  # 0 x infinity is reported below
+        raw = (weights * features[:, None]).sum(-1) + bias
     if not np.isfinite(raw).all():
         bad = raw[~np.isfinite(raw).all(axis=1)][0]
         raise ValueError(f"action {bad} before squashing, expected finite numbers: check z, h and C for NaN")

@@ -206,7 +206,9 @@ def test_a_nan_action_never_reaches_the_car(observations):
     agent = make_agent()
     agent.mdn_rnn.lstm.bias_ih_l0.data.fill_(float("nan"))
     agent.act(observations[0])
-    with pytest.raises(ValueError, match=r"action \[.*nan.*\] is not finite: check z, h and C"):
+    with pytest.raises(
+        ValueError, match=r"action \[.*nan.*\] before squashing, expected finite numbers: check z, h and C"
+    ):
         agent.act(observations[1])
 
 

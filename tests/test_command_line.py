@@ -181,12 +181,20 @@ def test_an_unknown_stage_or_setting_ends_in_one_clear_line(options, tmp_path, c
 
 
 @pytest.mark.parametrize(
-    "change", ["stride=x", "stride=2.7", "stride=1e999", "stride=0", "crop_bar=maybe", "sigma=NaN"]
+    ("change", "shown"),
+    [
+        ("stride=x", "x"),
+        ("stride=2.7", "2.7"),
+        ("stride=1e999", "inf"),
+        ("stride=0", "0"),
+        ("crop_bar=maybe", "maybe"),
+        ("sigma=NaN", "nan"),
+    ],
 )
-def test_a_wrong_value_of_a_setting_ends_in_one_clear_line(change, tmp_path, capsys):
+def test_a_wrong_value_of_a_setting_ends_in_one_clear_line(change, shown, tmp_path, capsys):
     error = the_error(capsys, train_quickly(tmp_path / "run", "--until", "rollouts", "--set", change))
     assert change.split("=")[0] in error
-    assert change.split("=")[1].lower() in error.lower()
+    assert shown in error
     assert "expected" in error
     assert not (tmp_path / "run").exists()
 

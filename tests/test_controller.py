@@ -58,7 +58,9 @@ def test_an_action_that_is_not_finite_is_refused(bad):
     features[1, 7] = bad
     parameters = random_parameters(1)[0]
     parameters[:40] = 0
-    with pytest.raises(ValueError, match=r"action \[.*nan.*\] is not finite: check z, h and C"):
+    with pytest.raises(
+        ValueError, match=r"action \[.*nan.*\] before squashing, expected finite numbers: check z, h and C"
+    ):
         control(parameters, features)
 
 

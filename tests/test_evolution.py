@@ -75,7 +75,7 @@ def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, 
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert "stopped; the same command goes on from here" in error
+    assert "stopped; the same command goes on from the last checkpoint" in error
     assert "Traceback" not in error
     assert 1 <= len(read(folder)["generations"]) < GENERATIONS  # it was in the middle
     subprocess.run(command, check=True, capture_output=True, timeout=120)
