@@ -98,7 +98,8 @@ def changed_settings(preset: str | None, changes: list[str]) -> Settings:
         try:
             values[name] = text if kinds.get(name, str) is str else json.loads(text)
         except json.JSONDecodeError:
-            raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}") from None
+            hint = " (true or false)" if kinds.get(name) is bool else ""
+            raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}{hint}") from None
     return Settings.preset(preset, **values)
 
 
@@ -109,7 +110,7 @@ def main(arguments: list[str] | None = None) -> int:
         if options.command == "train":
             settings = changed_settings(options.settings, options.set)
             if not train(options.variant, settings, options.out, options.rollouts, options.until):
-                print(f"{options.out} is finished: nothing to do")
+                print(f"everything up to {options.until} is there in {options.out}: nothing to do")
         elif options.command == "evaluate":
             result = evaluate(
                 options.variant, options.path, options.episodes, options.first_track, options.fast, options.processes

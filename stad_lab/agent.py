@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stad_lab.autoencoder import REMEDY, AutoEncoder, check_variant, load_autoencoder, to_pictures
+from stad_lab.autoencoder import REMEDY, AutoEncoder, check_part, check_variant, load_autoencoder, to_pictures
 from stad_lab.car_racing import MAX_FRAMES, make_env
 from stad_lab.checkpoints import load_tensors, save_tensors
 from stad_lab.controller import check_parameters, control, parameter_count
@@ -78,12 +78,12 @@ class Agent:
         self.latents, self.hidden = latents.numpy(), self.state[0][0].numpy()
         parameters = self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
         actions = control(parameters, np.concatenate([self.latents, self.hidden], axis=1))
-        self.state = self.mdn_rnn.step(latents, torch.from_numpy(actions), self.state)
+        _, self.state = self.mdn_rnn.remember(latents[:, None], torch.from_numpy(actions)[:, None], self.state)
         return actions
 
     def keep(self, cars: np.ndarray) -> None:
         """Go on with some of the cars only, until the next reset: `cars` are their indices among the present ones."""
-        self.memory.frames = type(self.memory.frames)((f[cars] for f in self.memory.frames), self.stride + 1)
+        self.memory.keep(cars)
         self.state = tuple(part[:, cars] for part in self.state)
         self.latents, self.hidden, self.cars = self.latents[cars], self.hidden[cars], self.cars[cars]
 
@@ -142,12 +142,19 @@ def drive(
     return returns, lengths
 
 
-@functools.lru_cache(maxsize=2)
-def load_world_model(folder: Path, variant: str) -> tuple[AutoEncoder, MDNRNN, int, bool]:
-    """V and M of a run, with stride and crop_bar; kept, so that a worker process reads them once."""
+def read_world_model(folder: Path, variant: str) -> tuple[AutoEncoder, MDNRNN, int, bool]:
+    """V and M of a run, with stride and crop_bar."""
     autoencoder, facts = load_autoencoder(folder / "autoencoder.safetensors", variant)
-    mdn_rnn, _ = load_mdn_rnn(folder / "mdn_rnn.safetensors", autoencoder.latent_size)
+    mdn_rnn, _ = load_mdn_rnn(folder / "mdn_rnn.safetensors", variant, autoencoder.latent_size)
     return autoencoder, mdn_rnn, facts["stride"], facts["crop_bar"]
+
+
+load_world_model = functools.lru_cache(maxsize=2)(read_world_model)  # so that a worker process reads them once
+
+
+def run_folder(variant: str, path: str | Path | None = None) -> Path:
+    """The folder of a run: `path`, or that of the agent that comes with stad_lab."""
+    return PRETRAINED / variant if path is None else Path(path)
 
 
 def load_agent(variant: str, path: str | Path | None = None) -> Agent:
@@ -162,7 +169,7 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
         FileNotFoundError: no such run, or the run is not finished.
     """
     check_variant(variant)
-    folder = PRETRAINED / variant if path is None else Path(path)
+    folder = run_folder(variant, path)
     if path is None and not (folder / "controller.safetensors").exists():
         shipped = ", ".join(sorted(file.parent.name for file in PRETRAINED.glob("*/controller.safetensors")))
         raise FileNotFoundError(
@@ -174,8 +181,8 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
             f"{folder} is {'empty' if folder.is_dir() else 'not a folder'}: expected a run made by"
             f" `python -m stad_lab train --variant {variant} --out {folder}`"
         )
-    autoencoder, mdn_rnn, stride, crop_bar = load_world_model.__wrapped__(folder, variant)
-    parameters = load_controller(folder / "controller.safetensors")
+    autoencoder, mdn_rnn, stride, crop_bar = read_world_model(folder, variant)
+    parameters = load_controller(folder / "controller.safetensors", variant)
     return Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
 
 
@@ -184,16 +191,15 @@ def save_controller(path: Path, parameters: np.ndarray, **facts) -> None:
     save_tensors(path, {"parameters": torch.from_numpy(parameters)}, part="controller", **facts)
 
 
-def load_controller(path: Path) -> np.ndarray:
+def load_controller(path: Path, variant: str) -> np.ndarray:
     """Read C's parameters, float64 (parameters,).
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: damaged, not C, or not finite.
+        ValueError: damaged, not C, of another variant, or not finite.
     """
     tensors, facts = load_tensors(path, REMEDY)
-    if facts.get("part") != "controller":
-        raise ValueError(f"{path} holds {facts.get('part')!r}: expected the parameters of a controller")
+    check_part(path, facts, "controller", variant)
     parameters = tensors["parameters"].double().numpy()
     check_parameters(parameters, parameters.shape[-1], path)
     return parameters

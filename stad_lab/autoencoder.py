@@ -150,8 +150,10 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
 
     @torch.no_grad()
     def heldout_losses() -> dict[str, float]:
-        parts = [losses_on(part, np.random.default_rng(0)) for part in np.array_split(heldout, 8)]
-        return {name: float(np.mean([part[name].item() for part in parts])) for name in parts[0]}
+        parts = np.array_split(heldout, min(8, len(heldout)))
+        losses = [losses_on(part, np.random.default_rng(0)) for part in parts]
+        weights = [len(part) for part in parts]
+        return {name: float(np.average([loss[name].item() for loss in losses], weights=weights)) for name in losses[0]}
 
     checkpoint = path.with_name("autoencoder.training.safetensors")
     label = f"train V ({variant})"
@@ -180,6 +182,16 @@ def save_autoencoder(path: Path, autoencoder: AutoEncoder, settings: Settings, h
     save_tensors(path, autoencoder.state_dict(), **facts, history=history)
 
 
+def check_part(path: Path, facts: dict, part: str, variant: str | None) -> None:
+    """Raise ValueError unless a file's facts say that it holds `part`, and of this variant unless that is None."""
+    if facts.get("part") != part:
+        raise ValueError(f"{path} holds {facts.get('part')!r}: expected {part!r}; give the file of that name")
+    if variant not in (None, facts.get("variant")):
+        raise ValueError(
+            f"{path} holds variant {facts.get('variant')!r}, and {variant!r} was asked for: give its own run"
+        )
+
+
 def load_autoencoder(path: Path, variant: str | None = None) -> tuple[AutoEncoder, dict]:
     """Read V: (the auto encoder in evaluation mode, the facts it was saved with, among them its history).
 
@@ -188,10 +200,7 @@ def load_autoencoder(path: Path, variant: str | None = None) -> tuple[AutoEncode
         ValueError: damaged, not V, or of another variant than `variant`.
     """
     tensors, facts = load_tensors(path, REMEDY)
-    if facts.get("part") != "autoencoder":
-        raise ValueError(f"{path} holds {facts.get('part')!r}: expected the weights of an autoencoder")
-    if variant not in (None, facts["variant"]):
-        raise ValueError(f"{path} holds variant {facts['variant']!r}, and {variant!r} was asked for: give its own run")
+    check_part(path, facts, "autoencoder", variant)
     autoencoder = AutoEncoder(facts["variant"], facts["latent_size"], facts["width"])
     load_into(autoencoder.to(memory_format=torch.channels_last), tensors, path)
     return autoencoder.eval().requires_grad_(False), facts

@@ -81,6 +81,12 @@ class FastCarRacing(reference.CarRacing):
         self._ground = None
         return super().reset(seed=seed, options=options)
 
+    def step(self, action: np.ndarray | None):
+        """As Gymnasium's step, but an action that is not finite is refused: a NaN once earned an instant 999 here."""
+        if action is not None and not np.isfinite(action).all():
+            raise ValueError(f"action {action}: expected finite numbers, steering, gas and brake")
+        return super().step(action)
+
     def close(self):
         """As Gymnasium's close, and lets go of the texture (20 MB), which reference cycles would keep for long."""
         super().close()

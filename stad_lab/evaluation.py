@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from tqdm.auto import tqdm
 
-from stad_lab.agent import PRETRAINED, load_agent
+from stad_lab.agent import load_agent, run_folder
 from stad_lab.checkpoints import checksum, save_json
 from stad_lab.evolution import drive_group
-from stad_lab.parallel import make_executor
+from stad_lab.parallel import worker_processes
 from stad_lab.rollouts import TRACK_RANGES
 
 SOLVED = 900  # CarRacing counts as solved at a mean return of 900 over 100 tracks
@@ -51,15 +51,12 @@ def evaluate(
             f" {low} to {high - 1}; those above are for training and validation"
         )
     agent = load_agent(variant, path)
-    folder = PRETRAINED / variant if path is None else Path(path)
+    folder = run_folder(variant, path)
     tracks = list(range(first_track, first_track + episodes))
-    executor = make_executor(processes)
-    try:
+    with worker_processes(processes) as executor:
         # One car at a time: in a batch the last bits differ, and a script that drives alone should get these numbers.
         futures = [executor.submit(drive_group, folder, variant, agent.parameters, [t], fast, None) for t in tracks]
         results = [future.result() for future in tqdm(futures, f"evaluate ({variant})", unit="episode")]
-    finally:
-        executor.shutdown(cancel_futures=True)
     returns, frames = (np.concatenate(part) for part in zip(*results, strict=True))
     return {
         "variant": variant,

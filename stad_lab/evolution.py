@@ -2,23 +2,25 @@
 
 The log is the state. CMA-ES is deterministic: its mean, step size, covariance, paths and random state follow from the
 seed and the fitnesses it was told. So a resumed run tells a new strategy every logged generation again (no car drives
-for that, it takes seconds) and then stands exactly where the old one stood. Nothing has to be unpickled.
+for that, it takes seconds) and then stands exactly where the old one stood, on the same machine and with the same
+versions of cma and numpy. Nothing has to be unpickled. All this runs on one thread, because the last bits of an
+eigendecomposition depend on the number of threads.
 """
 
 import dataclasses
 import zlib
-from collections.abc import Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 
 import cma
 import numpy as np
+from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent, drive, load_controller, load_world_model, save_controller
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.controller import initial_parameters
-from stad_lab.parallel import make_executor
+from stad_lab.parallel import worker_processes
 from stad_lab.rollouts import track_seeds
 from stad_lab.settings import Settings, check_same_run
 
@@ -42,35 +44,36 @@ def evolve(variant: str, settings: Settings, folder: Path) -> bool:
     """
     folder = Path(folder)
     log = read_log(variant, settings, folder)
-    controller = folder / CONTROLLER
-    if controller.exists():
-        load_controller(controller)
-    if len(log["generations"]) >= settings.generations and controller.exists():
-        return False
-    autoencoder, mdn_rnn, *_ = load_world_model(folder, variant)
-    start = initial_parameters(autoencoder.latent_size, mdn_rnn.hidden_size, settings.initial_gas)
-    if log["best"] and not controller.exists():
-        best = replay(start, settings, log["generations"][: log["best"]["generation"]])
-        save_controller(controller, best.mean, variant=variant, **log["best"])
-    strategy = replay(start, settings, log["generations"])
-    executor = make_executor(settings.processes)
-    done = len(log["generations"])
-    progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
-    try:
+    if (folder / CONTROLLER).exists():
+        load_controller(folder / CONTROLLER, variant)
+        if len(log["generations"]) >= settings.generations:
+            return False
+    with threadpool_limits(1), worker_processes(settings.processes) as executor:
+        strategy = resume(variant, settings, folder, log)
+        done = len(log["generations"])
+        progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
         for generation in progress:
             population = np.array(strategy.ask())
             entry = drive_generation(executor, folder, variant, settings, generation, population)
             strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
             entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy)}
-            if (generation + 1) % settings.validate_every == 0 or generation + 1 == settings.generations:
+            if (generation + 1) % settings.validate_every == 0:
                 validate(executor, folder, variant, settings, strategy.mean, entry, log)
             log["generations"].append(entry)
             save_json(folder / LOG, log)
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
-    finally:
-        executor.shutdown(cancel_futures=True)
     return True
+
+
+def resume(variant: str, settings: Settings, folder: Path, log: dict) -> cma.CMAEvolutionStrategy:
+    """The strategy as the log left it; makes `controller.safetensors` again if it was lost."""
+    autoencoder, mdn_rnn, *_ = load_world_model(folder, variant)
+    start = initial_parameters(autoencoder.latent_size, mdn_rnn.hidden_size, settings.initial_gas)
+    if log["best"] and not (folder / CONTROLLER).exists():
+        best = replay(start, settings, log["generations"][: log["best"]["generation"]])
+        save_controller(folder / CONTROLLER, best.mean, variant=variant, **log["best"])
+    return replay(start, settings, log["generations"])
 
 
 def read_log(variant: str, settings: Settings, folder: Path) -> dict:
@@ -125,9 +128,7 @@ def drive_generation(
     """Let every agent drive the generation's tracks; returns the log's entry with "returns" [agent][track]."""
     tracks = track_seeds("evolve", settings.tracks, settings.seed, generation)
     agents = np.repeat(population, len(tracks), axis=0)
-    returns, lengths = drive_parallel(
-        executor, folder, variant, agents, tracks * len(population), settings.cars, True, settings
-    )
+    returns, lengths = drive_parallel(executor, folder, variant, agents, tracks * len(population), settings)
     shape = (len(population), len(tracks))
     return {
         "generation": generation + 1,
@@ -143,8 +144,8 @@ def validate(
     """Drive the CMA mean on the validation tracks; notes it in `entry`, and keeps it as C if it is the best so far."""
     tracks = track_seeds("validate", settings.validation_tracks)  # the same ones for every seed
     means = np.repeat(mean[None], len(tracks), axis=0)
-    limits = dataclasses.replace(settings, patience=0)  # as in the final evaluation: nobody is given up on
-    returns, lengths = drive_parallel(executor, folder, variant, means, tracks, settings.cars, True, limits)
+    patient = dataclasses.replace(settings, patience=0)  # as in the final evaluation: nobody is given up on
+    returns, lengths = drive_parallel(executor, folder, variant, means, tracks, patient)
     entry["validation"] = {"mean": float(returns.mean()), "returns": returns.tolist(), "frames": int(lengths.sum())}
     if log["best"] is None or returns.mean() > log["best"]["validation"]:
         log["best"] = {"generation": entry["generation"], "validation": float(returns.mean())}
@@ -152,27 +153,17 @@ def validate(
 
 
 def drive_parallel(
-    executor: Executor,
-    folder: Path,
-    variant: str,
-    parameters: np.ndarray,
-    tracks: Sequence[int],
-    cars: int,
-    fast: bool,
-    limits: Settings | None = None,
+    executor: Executor, folder: Path, variant: str, parameters: np.ndarray, tracks: list[int], settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Drive one episode for each row of `parameters`, in groups of `cars`: (returns, lengths in frames).
+    """Drive one episode for each row of `parameters` (episodes, parameters): (returns, lengths in frames).
 
-    The groups depend on `cars` alone, so the numbers do not depend on how many processes share the work.
-
-    Args:
-        parameters: (episodes, parameters).
-        tracks: seeds, one for each episode.
-        limits: whose max_frames and patience to apply; None for CarRacing's own rules.
+    They drive in groups of `settings.cars`, under its max_frames and patience. The groups do not depend on how many
+    processes share them, so neither do the numbers.
     """
-    groups = [slice(start, start + cars) for start in range(0, len(tracks), cars)]
+    starts = range(0, len(tracks), settings.cars)
+    groups = [slice(start, start + settings.cars) for start in starts]
     futures = [
-        executor.submit(drive_group, folder, variant, parameters[group], tracks[group], fast, limits)
+        executor.submit(drive_group, folder, variant, parameters[group], tracks[group], True, settings)
         for group in groups
     ]
     results = [future.result() for future in futures]

@@ -75,15 +75,15 @@ def episode_differences(frames: np.ndarray, stride: int) -> np.ndarray:
 class FrameMemory:
     """The last few frames of one car or of many cars in step: what a driver needs to form difference images.
 
-    Frames may have any shape, for example (64, 64, 3) or (cars, 64, 64, 3), the same from reset to reset.
+    Frames may have any shape, for example (64, 64, 3) or (cars, 64, 64, 3). A new episode begins with a new memory.
     """
 
     def __init__(self, stride: int):
         self.frames: deque[np.ndarray] = deque(maxlen=stride + 1)
 
-    def reset(self) -> None:
-        """Forget everything: an episode begins."""
-        self.frames.clear()
+    def keep(self, cars: np.ndarray) -> None:
+        """Go on with some of the cars only, by their indices on the first axis."""
+        self.frames = deque((frames[cars] for frames in self.frames), self.frames.maxlen)
 
     def push(self, frame: np.ndarray) -> np.ndarray:
         """Take in the newest frame and return the one to subtract from it: `stride` ago, or itself at the start."""

@@ -11,8 +11,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from torch import nn
+from tqdm.auto import tqdm
 
-from stad_lab.autoencoder import REMEDY, AutoEncoder, check_facts, load_autoencoder, to_pictures
+from stad_lab.autoencoder import REMEDY, AutoEncoder, check_facts, check_part, load_autoencoder, to_pictures
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
@@ -36,7 +37,7 @@ class Mixture(NamedTuple):
 class MDNRNN(nn.Module):
     """M: latents and actions -> the distribution of the next latents.
 
-    One step and a whole sequence are the same call: a step is a sequence of length one.
+    One step and a whole sequence run the same code: a step is a sequence of length one.
 
     Args:
         latent_size: dimensions of z.
@@ -63,12 +64,12 @@ class MDNRNN(nn.Module):
         Returns:
             The mixture for every step, and the memory after the last.
         """
-        hidden, state = self.lstm(torch.cat([latents, actions], dim=2), state)
+        hidden, state = self.remember(latents, actions, state)
         return self.mixture(hidden), state
 
-    def step(self, latents: torch.Tensor, actions: torch.Tensor, state: State | None) -> State:
-        """Only remember: one step for a batch of cars, z (batch, latent_size), actions (batch, 3). No prediction."""
-        return self.lstm(torch.cat([latents, actions], dim=1)[:, None], state)[1]
+    def remember(self, latents: torch.Tensor, actions: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
+        """The memory without the prediction: h after every step (batch, time, hidden_size), and the state."""
+        return self.lstm(torch.cat([latents, actions], dim=2), state)
 
     def mixture(self, hidden: torch.Tensor) -> Mixture:
         """The head: h (batch, time, hidden_size) -> the mixture it stands for."""
@@ -118,7 +119,7 @@ def check_temperature(temperature: float) -> None:
 def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -> list[np.ndarray]:
     """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
     encoded = []
-    for episode in range(len(rollouts.frames)):
+    for episode in tqdm(range(len(rollouts.frames)), "encode", unit="episode"):
         indices = np.flatnonzero(rollouts.episode == episode)
         parts = [
             torch.stack(autoencoder.encode(*to_pictures(*rollouts.pairs(part, stride))))
@@ -160,7 +161,7 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     """
     path = Path(folder) / "mdn_rnn.safetensors"
     if path.exists():
-        check_facts(path, load_mdn_rnn(path)[1], settings)
+        check_facts(path, load_mdn_rnn(path, variant)[1], settings)
         return False
     v_path = path.with_name("autoencoder.safetensors")
     autoencoder, v_facts = load_autoencoder(v_path, variant)
@@ -190,27 +191,26 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     history = fit(
         mdn_rnn, batch_losses, heldout_losses, settings.m_steps, settings.m_learning_rate, checkpoint, "train M"
     )
-    save_mdn_rnn(path, mdn_rnn, history)
+    save_mdn_rnn(path, mdn_rnn, variant, history)
     checkpoint.unlink()
     return True
 
 
-def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, history: list) -> None:
-    """Write M's weights with what is needed to build it again."""
+def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list) -> None:
+    """Write M's weights with what is needed to build it again, and the variant of the V that it belongs to."""
     sizes = {name: getattr(mdn_rnn, name) for name in ("latent_size", "hidden_size", "mixtures")}
-    save_tensors(path, mdn_rnn.state_dict(), part="mdn_rnn", **sizes, history=history)
+    save_tensors(path, mdn_rnn.state_dict(), part="mdn_rnn", variant=variant, **sizes, history=history)
 
 
-def load_mdn_rnn(path: Path, latent_size: int | None = None) -> tuple[MDNRNN, dict]:
+def load_mdn_rnn(path: Path, variant: str | None = None, latent_size: int | None = None) -> tuple[MDNRNN, dict]:
     """Read M: (the MDN-RNN in evaluation mode, the facts it was saved with, among them its history).
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: damaged, not M, or for another latent size than `latent_size`.
+        ValueError: damaged, not M, or for a V of another variant or latent size.
     """
     tensors, facts = load_tensors(path, REMEDY)
-    if facts.get("part") != "mdn_rnn":
-        raise ValueError(f"{path} holds {facts.get('part')!r}: expected the weights of an mdn_rnn")
+    check_part(path, facts, "mdn_rnn", variant)
     if latent_size not in (None, facts["latent_size"]):
         raise ValueError(
             f"{path} was trained for latent_size {facts['latent_size']}, V has {latent_size}: use M and V of one run"

@@ -13,7 +13,6 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -76,7 +75,7 @@ def train(
                 save_json(folder / "record.json", record)
         print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
         worked |= did
-    if worked:
+    if worked or "budget" not in record:
         record["budget"] = budget(folder, rollouts_folder)
         save_json(folder / "record.json", record)
     return worked
@@ -90,7 +89,12 @@ def open_record(folder: Path, variant: str, settings: Settings) -> dict:
     """
     path = folder / "record.json"
     if not path.exists():
-        record = {"variant": variant, "settings": settings.as_dict(), "made_with": provenance(), "seconds": {}}
+        record = {
+            "variant": variant,
+            "settings": settings.as_dict(),
+            "made_with": provenance(variant, settings),
+            "seconds": {},
+        }
         save_json(path, record)
         return record
     record = load_json(path)
@@ -100,16 +104,24 @@ def open_record(folder: Path, variant: str, settings: Settings) -> dict:
     return record | {"settings": settings.as_dict()}
 
 
-def provenance() -> dict:
+def command_of(variant: str, settings: Settings) -> str:
+    """The command line that makes a run of these settings again."""
+    preset = Settings.preset(settings.name).as_dict()
+    changes = [f"--set {name}={value}" for name, value in settings.as_dict().items() if value != preset[name]]
+    return " ".join([f"python -m stad_lab train --variant {variant} --settings {settings.name} --out ...", *changes])
+
+
+def provenance(variant: str, settings: Settings) -> dict:
     """What the run was made with: versions, machine, and the commit if the code lies in a git checkout."""
+    changes = git("status", "--porcelain", "--untracked-files=no", "--", ".")
     return {
         "python": platform.python_version(),
         **{package: importlib.metadata.version(package) for package in PACKAGES},
         "platform": f"{platform.system()} {platform.machine()}",
         "cores": os.cpu_count(),
         "commit": git("rev-parse", "HEAD"),
-        "uncommitted_changes": bool(git("status", "--porcelain", "--", str(Path(__file__).parent))),
-        "command": " ".join(["python -m stad_lab", *sys.argv[1:]]),
+        "uncommitted_changes": changes if changes is None else bool(changes),
+        "command": command_of(variant, settings),
     }
 
 
@@ -123,20 +135,20 @@ def git(*arguments: str) -> str | None:
 
 
 def budget(folder: Path, rollouts_folder: Path) -> dict:
-    """Every episode and frame ever driven for this run, by what it was driven for."""
+    """Every logged episode and frame that was driven for this run, by what it was driven for."""
     blocks = load_json(rollouts_folder / "manifest.json")["blocks"]
     spent = {"random": {"episodes": len(blocks), "frames": sum(block["frames"] for block in blocks)}}
     if (folder / LOG).exists():
         log = load_json(folder / LOG)["generations"]
-        looks = [entry["validation"] for entry in log if "validation" in entry]
+        validations = [entry["validation"] for entry in log if "validation" in entry]
         spent["agents"] = sum(len(entry["returns"]) for entry in log)
         spent["evolution"] = {
             "episodes": sum(len(returns) for entry in log for returns in entry["returns"]),
             "frames": sum(entry["frames"] for entry in log),
         }
         spent["validation"] = {
-            "episodes": sum(len(look["returns"]) for look in looks),
-            "frames": sum(look["frames"] for look in looks),
+            "episodes": sum(len(validation["returns"]) for validation in validations),
+            "frames": sum(validation["frames"] for validation in validations),
         }
     return spent
 
@@ -157,7 +169,7 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
         if (folder / name).exists():
             tensors, facts = load_tensors(folder / name)
             small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
-            save_tensors(target / name, small, **facts)
+            save_tensors(target / name, small, **facts | {"variant": variant})
     for name in ("record.json", LOG):
         if (folder / name).exists():
             shutil.copyfile(folder / name, target / name)

@@ -60,8 +60,8 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
     """How much of the picture changes against how fast the car is.
 
     Args:
-        speed: of the car in every frame, world units per second.
-        change: stride -> mean |d| of every frame.
+        speed: of the car in every ride, world units per second.
+        change: stride -> mean |d| at the end of every ride.
     """
     figure, ((axis,),) = new_figure(6.5, 3.6)
     for (stride, values), color in zip(change.items(), COLORS, strict=False):
@@ -73,7 +73,7 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
     axis.legend(frameon=False)
     title = "The difference image grows with speed, and with the stride"
     axis.set_title(title, fontsize=11)
-    figure.set_label(f"{title}: one point for every frame of an episode, strides {', '.join(map(str, change))}.")
+    figure.set_label(f"{title}: one point for every ride and stride; strides {', '.join(map(str, change))}.")
     return figure
 
 
@@ -190,7 +190,9 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
             *zip(*validation.items(), strict=True), "o--", color="black", ms=4, label="CMA mean, validation tracks"
         )
     axis.axhline(900, color="grey", lw=0.8, ls=":")
-    axis.set(xlabel="generation", ylabel="return of an episode", ylim=(min(-60, curves.min() - 20), 1000))
+    axis.set(
+        xlabel="generation", ylabel="fitness: mean return over the tracks", ylim=(min(-60, curves.min() - 20), 1000)
+    )
     axis.legend(frameon=False, fontsize=9)
     axis.set_title(title, fontsize=11)
     figure.set_label(

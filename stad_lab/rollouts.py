@@ -7,6 +7,7 @@ dataset may be larger than the memory.
 """
 
 import io
+import time
 from concurrent.futures import as_completed
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from tqdm.auto import tqdm
 from stad_lab.car_racing import make_env, place_car
 from stad_lab.checkpoints import checksum, load_json, save_json, write_bytes
 from stad_lab.frames import FRAME_SIZE, earlier_index, to_frame
-from stad_lab.parallel import make_executor
+from stad_lab.parallel import worker_processes
 from stad_lab.settings import Settings
 
 # Tracks are named by the seed of `env.reset`. The four uses never share one: an agent is reported on tracks that
@@ -129,17 +130,15 @@ def collect_rollouts(settings: Settings, folder: Path) -> bool:
         return False
     folder.mkdir(parents=True, exist_ok=True)
     for left_over in folder.glob(".*.part"):
-        left_over.unlink()
+        if time.time() - left_over.stat().st_mtime > 60:  # a younger one may be in another run's hands
+            left_over.unlink(missing_ok=True)
     save_json(manifest_path, manifest)
-    executor = make_executor(settings.processes)
-    try:
+    with worker_processes(settings.processes) as executor:
         futures = [executor.submit(collect_block, settings, index, folder) for index in missing]
         progress = tqdm(as_completed(futures), "collect", settings.episodes, initial=len(done), unit="episode")
         for future in progress:
             manifest["blocks"] = sorted([*manifest["blocks"], future.result()], key=lambda entry: entry["index"])
             save_json(manifest_path, manifest)
-    finally:
-        executor.shutdown(cancel_futures=True)
     return True
 
 

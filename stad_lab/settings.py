@@ -1,7 +1,7 @@
 """The settings: one frozen dataclass with three presets, `quick`, `laptop` and `paper`.
 
-Every number that shapes a run is here, with its unit; nothing else is configured anywhere. A run's settings are written
-into its folder, so a result can always be traced back to them.
+Every number that one may want to change for a run is here, with its unit. A run's settings are written into its folder,
+so a result can always be traced back to them.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ class Settings:
     name: str = "laptop"
     """Name of the preset these settings began as."""
     seed: int = 0
-    """Seed of the whole run: data, weights, tracks and mutations follow from it."""
+    """Seed of the whole run: data, weights, mutations and all tracks but those for validation follow from it."""
     processes: int = 2
     """Worker processes that drive cars. The results do not depend on it."""
 
@@ -102,6 +102,11 @@ class Settings:
             raise ValueError(
                 f"episode_frames={self.episode_frames}, but with stride={self.stride} the first difference image"
                 f" exists only after {self.stride} frames: use more than {self.stride} frames"
+            )
+        if self.generations % self.validate_every:
+            raise ValueError(
+                f"generations={self.generations} is not a multiple of validate_every={self.validate_every}: the last"
+                " generation must be one that is validated"
             )
         if self.m_sequence >= self.episode_frames:
             raise ValueError(
@@ -188,7 +193,7 @@ PRESETS = {
         m_steps=20,
         m_batch=8,
         m_sequence=24,
-        generations=3,
+        generations=4,
         population=4,
         tracks=1,
         max_frames=60,

@@ -49,11 +49,11 @@ def explore(draw: Callable[..., Figure], **controls: ipywidgets.Widget) -> ipywi
         draw: takes the controls' values by name, returns a Figure.
         **controls: widgets with a `value`.
     """
-    picture = ipywidgets.Image(format="png")
+    picture = ipywidgets.HTML()
 
     def redraw(_change=None) -> None:
         figure = draw(**{name: control.value for name, control in controls.items()})
-        picture.value = to_png(figure)
+        picture.value = show(figure).data
 
     for control in controls.values():
         control.observe(redraw, "value")
@@ -65,7 +65,7 @@ def slider(low: float, high: float, value: float, label: str) -> ipywidgets.Widg
     """A slider that acts when it is let go: of whole numbers if all three are whole."""
     whole = all(isinstance(number, int) for number in (low, high, value))
     kind = ipywidgets.IntSlider if whole else ipywidgets.FloatSlider
-    step = 1 if whole else (high - low) / 60
+    step = 1 if whole else 0.05
     return kind(
         value,
         min=low,

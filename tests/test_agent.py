@@ -261,8 +261,10 @@ def test_weights_that_stad_lab_did_not_write_are_refused(quick_run, tmp_path):
 
 def test_a_controller_is_read_as_it_was_written(tmp_path):
     parameters = np.random.default_rng(0).standard_normal(867)
-    save_controller(tmp_path / "c.safetensors", parameters)
-    assert np.array_equal(load_controller(tmp_path / "c.safetensors"), parameters)
+    save_controller(tmp_path / "c.safetensors", parameters, variant="input")
+    assert np.array_equal(load_controller(tmp_path / "c.safetensors", "input"), parameters)
+    with pytest.raises(ValueError, match="holds variant 'input', and 'frame' was asked for: give its own run"):
+        load_controller(tmp_path / "c.safetensors", "frame")
 
 
 def test_a_shipped_agent_acts_almost_like_the_run_it_comes_from(quick_run, agent, observations, tmp_path):

@@ -230,3 +230,10 @@ def test_place_car_moves_the_car_sideways():
     half_road = 40 / 6
     assert dx * math.cos(beta) + dy * math.sin(beta) == pytest.approx(half_road, abs=1e-3)
     assert -dx * math.sin(beta) + dy * math.cos(beta) == pytest.approx(0, abs=1e-3)
+
+
+def test_an_action_that_is_not_finite_is_refused():
+    env = make_env()
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action \[.*nan.*\]: expected finite numbers, steering, gas and brake"):
+        env.step(np.array([0, np.nan, 0]))

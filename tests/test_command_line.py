@@ -72,7 +72,7 @@ def test_a_run_leaves_weights_log_and_record(quick_training):
     assert record["seconds"].keys() == {"rollouts", "autoencoder", "mdn_rnn", "controller"}
     assert record["made_with"]["torch"] == importlib.metadata.version("torch")
     assert record["budget"]["random"] == {"episodes": 8, "frames": 8 * 60}
-    assert record["budget"]["agents"] == record["budget"]["evolution"]["episodes"] == 3 * 4
+    assert record["budget"]["agents"] == record["budget"]["evolution"]["episodes"] == 4 * 4
     assert record["budget"]["validation"]["episodes"] == 2 * 2
 
 
@@ -80,7 +80,7 @@ def test_the_second_run_of_a_command_does_nothing_and_says_so(run, command_line)
     before = states(run)
     process = command_line(*train_quickly(run))
     assert process.returncode == 0, process.stderr
-    assert f"{run} is finished: nothing to do" in process.stdout
+    assert f"everything up to controller is there in {run}: nothing to do" in process.stdout
     assert process.stdout.count("already there, nothing to do") == 4
     after = states(run)
     assert after.keys() == before.keys()
@@ -244,7 +244,7 @@ def test_v_of_another_size_ends_in_one_clear_line(run, capsys):
 
 
 def test_c_of_another_size_ends_in_one_clear_line(run, capsys):
-    save_controller(run / "controller.safetensors", np.zeros(867))
+    save_controller(run / "controller.safetensors", np.zeros(867), variant="input_output")
     error = the_error(capsys, evaluate_quickly(run))
     assert "(867,), expected (195,)" in error
     assert "belongs to a V or M of another size" in error
@@ -256,7 +256,7 @@ def test_training_on_top_of_weights_of_another_size_ends_in_one_clear_line(part,
         save_autoencoder(run / f"{part}.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
         (run / "mdn_rnn.safetensors").unlink()
     else:
-        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 32, 5), [])
+        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 32, 5), "input_output", [])
     (run / "controller.safetensors").unlink()
     (run / "evolution.json").unlink()
     error = the_error(capsys, train_quickly(run))

@@ -1,6 +1,7 @@
 """CMA-ES over C: a log of every generation, and an interrupt that changes nothing."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -116,7 +117,35 @@ def test_the_controller_is_the_mean_that_drove_the_validation_tracks_best(one_go
     assert log["best"] == {"generation": max(looks, key=looks.get), "validation": max(looks.values())}
     start = initial_parameters(32, 32, settings().initial_gas)
     best = replay(start, settings(), log["generations"][: log["best"]["generation"]])
-    assert np.array_equal(load_controller(one_go / "controller.safetensors"), best.mean)
+    assert np.array_equal(load_controller(one_go / "controller.safetensors", "input_output"), best.mean)
+
+
+THREADS = """
+import numpy as np
+from stad_lab.controller import initial_parameters
+from stad_lab.evolution import evolve, make_strategy, mean_checksum, threadpool_limits
+from stad_lab.settings import Settings
+with threadpool_limits(1):
+    strategy = make_strategy(initial_parameters(32, 256), Settings.preset("laptop"))
+    for _ in range(12):
+        population = np.array(strategy.ask())
+        strategy.tell(population, (population**2).sum(axis=1))
+print(mean_checksum(strategy))
+"""
+
+
+def test_the_strategy_of_867_parameters_does_not_depend_on_the_number_of_threads():
+    sums = [
+        subprocess.run(
+            [sys.executable, "-c", THREADS],
+            env=os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2")
+    ]
+    assert sums[0] == sums[1] != ""
 
 
 def test_a_replay_restores_the_full_state():

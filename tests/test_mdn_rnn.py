@@ -83,7 +83,7 @@ def test_a_sequence_equals_repeated_single_steps():
     state = remembered = None
     for t in range(latents.shape[1]):
         step, state = mdn_rnn(latents[:, t : t + 1], actions[:, t : t + 1], state)
-        remembered = mdn_rnn.step(latents[:, t], actions[:, t], remembered)
+        _, remembered = mdn_rnn.remember(latents[:, t : t + 1], actions[:, t : t + 1], remembered)
         for part, name in zip(step, Mixture._fields, strict=True):
             assert torch.allclose(part[:, 0], getattr(whole, name)[:, t], atol=1e-6)
     for final in (state, remembered):
@@ -196,18 +196,24 @@ def test_an_interrupted_training_equals_an_uninterrupted_one_bit_for_bit(quick_r
 
 def test_saved_weights_are_loaded_to_the_same_predictions(tmp_path):
     mdn_rnn = make_mdn_rnn()
-    save_mdn_rnn(tmp_path / "m.safetensors", mdn_rnn, [])
+    save_mdn_rnn(tmp_path / "m.safetensors", mdn_rnn, "input", [])
     loaded, facts = load_mdn_rnn(tmp_path / "m.safetensors", latent_size=4)
     assert torch.equal(loaded(*make_sequence())[0].mean, mdn_rnn(*make_sequence())[0].mean)
     assert (facts["latent_size"], facts["hidden_size"], facts["mixtures"]) == (4, 8, 3)
 
 
 def test_weights_for_another_latent_size_are_refused(tmp_path):
-    save_mdn_rnn(tmp_path / "m.safetensors", make_mdn_rnn(), [])
+    save_mdn_rnn(tmp_path / "m.safetensors", make_mdn_rnn(), "input", [])
     with pytest.raises(ValueError, match="trained for latent_size 4, V has 32: use M and V of one run"):
         load_mdn_rnn(tmp_path / "m.safetensors", latent_size=32)
 
 
+def test_weights_for_another_variant_are_refused(tmp_path):
+    save_mdn_rnn(tmp_path / "m.safetensors", make_mdn_rnn(), "input", [])
+    with pytest.raises(ValueError, match="holds variant 'input', and 'frame' was asked for: give its own run"):
+        load_mdn_rnn(tmp_path / "m.safetensors", "frame")
+
+
 def test_weights_of_another_part_are_refused(quick_run):
-    with pytest.raises(ValueError, match="holds 'autoencoder': expected the weights of an mdn_rnn"):
+    with pytest.raises(ValueError, match="holds 'autoencoder': expected 'mdn_rnn'"):
         load_mdn_rnn(quick_run / "autoencoder.safetensors")
