@@ -252,7 +252,11 @@ def moving_picture(columns: dict[str, np.ndarray], fps: float = 25, size: int = 
             left = place * (size + gap)
             draw.text((left + size / 2, header / 2), title, fill="black", font=font, anchor="mm")
             page.paste(Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST), (left, header))
-        pages.append(page.quantize(64, dither=Image.Dither.NONE))
+        pages.append(page)
+    # One palette for the whole film, or colours would flicker; "maximum coverage" keeps rare ones, as the car's red.
+    sample = np.concatenate([np.asarray(page) for page in pages[:: max(1, len(pages) // 8)]])
+    palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE)
+    pages = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pages]
     buffer = io.BytesIO()
     pages[0].save(buffer, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
     return buffer.getvalue()

@@ -199,7 +199,7 @@ def test_weights_of_another_variant_are_refused(quick_run):
 
 
 def test_weights_of_another_part_are_refused(quick_run):
-    with pytest.raises(ValueError, match="holds 'mdn_rnn': expected the weights of an autoencoder"):
+    with pytest.raises(ValueError, match="holds 'mdn_rnn': expected 'autoencoder'"):
         load_autoencoder(quick_run / "mdn_rnn.safetensors")
 
 
