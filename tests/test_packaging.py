@@ -112,3 +112,12 @@ def test_nothing_that_is_read_can_run_code(file):
         if isinstance(node, ast.Import | ast.ImportFrom):
             modules = [alias.name for alias in node.names] + [getattr(node, "module", None)]
             assert not {"pickle", "dill", "joblib", "shelve", "marshal"} & set(modules)
+
+
+def test_ci_runs_the_one_test_command_of_the_readme():
+    commands = [line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("python3 ")]
+    assert [command.split("/")[-1].split()[0] for command in commands] == ["jupyter", "pytest"]
+    assert all(
+        command.startswith("python3 -m venv .venv && .venv/bin/pip install -r environment.txt") for command in commands
+    )
+    assert "grep -m 1 '^python3 .*pytest' README.md" in (ROOT / ".ci" / "run").read_text()
