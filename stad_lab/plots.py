@@ -50,7 +50,7 @@ def plot_pictures(rows: list[list[np.ndarray | None]], columns: list[str], names
     for column, axis in zip(columns, axes[0], strict=True):
         axis.set_title(column, fontsize=9)
     if drawn is not None:
-        figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label="difference d (of 1 = full brightness)")
+        figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label="difference d")
     figure.suptitle(title, fontsize=11)
     figure.set_label(f"{title}. Rows: {', '.join(filter(None, names)) or 'one'}; columns: {', '.join(columns)}.")
     return figure
