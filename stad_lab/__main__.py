@@ -9,8 +9,8 @@ from pathlib import Path
 
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import VARIANTS
-from stad_lab.checkpoints import write_bytes
-from stad_lab.evaluation import describe, evaluate, save_evaluation
+from stad_lab.checkpoints import save_json, write_bytes
+from stad_lab.evaluation import describe, evaluate
 from stad_lab.film import film_agent
 from stad_lab.pipeline import STAGES, ship, train
 from stad_lab.settings import PRESETS, Settings
@@ -116,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
                 options.variant, options.path, options.episodes, options.first_track, options.fast, options.processes
             )
             file = options.json or (options.path or Path()) / f"evaluation-{options.variant}.json"
-            save_evaluation(file, result)
+            save_json(file, result)
             print(describe(result))
             print(f"  every episode: {file}")
         elif options.command == "ship":

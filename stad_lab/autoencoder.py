@@ -18,7 +18,7 @@ from torch import nn
 
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
 from stad_lab.rollouts import Rollouts
-from stad_lab.settings import Settings
+from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import fit
 
 VARIANTS = ("frame", "input", "output", "input_output")
@@ -167,12 +167,7 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
 
 def check_facts(path: Path, facts: dict, settings: Settings) -> None:
     """Raise ValueError if weights were made with other settings, as far as their facts tell, than asked for now."""
-    for name, wanted in settings.as_dict().items():
-        if name in facts and facts[name] != wanted:
-            raise ValueError(
-                f"{path} was made with {name}={facts[name]!r}, and now {name}={wanted!r} is asked for:"
-                " choose another folder, or the same settings"
-            )
+    check_same_run(path, facts, {name: wanted for name, wanted in settings.as_dict().items() if name in facts})
 
 
 def save_autoencoder(path: Path, autoencoder: AutoEncoder, settings: Settings, history: list) -> None:

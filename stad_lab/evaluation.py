@@ -10,7 +10,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from stad_lab.agent import load_agent, run_folder
-from stad_lab.checkpoints import checksum, save_json
+from stad_lab.checkpoints import checksum
 from stad_lab.evolution import drive_group
 from stad_lab.parallel import worker_processes
 from stad_lab.rollouts import TRACK_RANGES
@@ -93,8 +93,3 @@ def describe(result: dict) -> str:
         f"  standard deviation {result['standard_deviation']:.1f}, 95% interval of the mean {low:.1f} to {high:.1f},"
         f" {100 * result['above_900']:.0f}% of the episodes above {SOLVED}"
     )
-
-
-def save_evaluation(path: Path, result: dict) -> None:
-    """Write an evaluation as JSON, atomically."""
-    save_json(path, result)

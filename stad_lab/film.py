@@ -7,7 +7,7 @@ from stad_lab.agent import Agent
 from stad_lab.autoencoder import to_pictures
 from stad_lab.car_racing import make_env
 from stad_lab.dream import to_uint8
-from stad_lab.frames import earlier_index, to_frame
+from stad_lab.frames import earlier_frames, to_frame
 from stad_lab.plots import difference_colors, moving_picture
 
 
@@ -42,7 +42,7 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
     if len(observations) <= first:
         raise ValueError(f"first={first}, but on track {track} the episode ends after {len(observations)} frames")
     film = np.array([to_frame(observation, agent.crop_bar) for observation in observations])
-    earlier = film[earlier_index(np.arange(len(film)), agent.stride)]
+    earlier = earlier_frames(film, agent.stride)
     shown = slice(first, None, every)
     frame, difference = to_pictures(film[shown], earlier[shown])
     columns = {

@@ -67,9 +67,14 @@ def earlier_index(index: np.ndarray | int, stride: int) -> np.ndarray:
     return np.where(index >= stride, index - stride, index)
 
 
+def earlier_frames(frames: np.ndarray, stride: int) -> np.ndarray:
+    """For every frame of an episode the one to subtract from it: uint8 (frames, 64, 64, 3), a copy."""
+    return frames[earlier_index(np.arange(len(frames)), stride)]
+
+
 def episode_differences(frames: np.ndarray, stride: int) -> np.ndarray:
     """All difference images of an episode: uint8 (frames, 64, 64, 3) -> float32 in [-1, 1] of the same shape."""
-    return difference_image(frames, frames[earlier_index(np.arange(len(frames)), stride)])
+    return difference_image(frames, earlier_frames(frames, stride))
 
 
 class FrameMemory:

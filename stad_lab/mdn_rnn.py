@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from stad_lab.autoencoder import REMEDY, AutoEncoder, check_facts, check_part, load_autoencoder, to_pictures
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
+from stad_lab.frames import earlier_frames
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
 from stad_lab.training import fit
@@ -119,12 +120,11 @@ def check_temperature(temperature: float) -> None:
 def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -> list[np.ndarray]:
     """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
     encoded = []
-    for episode in tqdm(range(len(rollouts.frames)), "encode", unit="episode"):
-        indices = np.flatnonzero(rollouts.episode == episode)
-        parts = [
-            torch.stack(autoencoder.encode(*to_pictures(*rollouts.pairs(part, stride))))
-            for part in np.array_split(indices, max(1, len(indices) // 250))
-        ]
+    for mapped in tqdm(rollouts.frames, "encode", unit="episode"):
+        frames = np.array(mapped)  # into memory: torch takes no read-only arrays
+        count = max(1, len(frames) // 250)
+        pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
+        parts = [torch.stack(autoencoder.encode(*to_pictures(*pair))) for pair in pairs]
         encoded.append(torch.cat(parts, dim=1).numpy())
     return encoded
 

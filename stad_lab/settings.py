@@ -170,12 +170,12 @@ def known_fields(values: dict) -> dict:
 MAY_CHANGE = ("name", "processes", "generations")  # between a run and its continuation
 
 
-def check_same_run(folder: Path, was: dict, now: dict) -> None:
-    """Raise ValueError if `folder` holds a run whose variant or settings differ from those asked for now."""
+def check_same_run(path: Path, was: dict, now: dict) -> None:
+    """Raise ValueError if the run in `path`, a folder or a file of it, was made with other values than `now` holds."""
     for name in now:
         if name not in MAY_CHANGE and was.get(name) != now[name]:
             raise ValueError(
-                f"{folder} holds a run with {name}={was.get(name)!r}, and now {name}={now[name]!r} is asked for:"
+                f"{path} holds a run with {name}={was.get(name)!r}, and now {name}={now[name]!r} is asked for:"
                 " choose another folder, or the same variant and settings"
             )
 
