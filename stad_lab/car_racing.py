@@ -2,18 +2,21 @@
 
 Gymnasium draws some 500 polygons into 1000 x 800 pixels for every observation and shrinks the result to 96 x 96; that
 is 98% of its time. But the ground hardly changes within an episode. So `FastCarRacing` paints it once into one large
-texture, and each frame needs only four things:
+texture, and each frame needs only three things:
 
-1. one affine warp of the texture to what the camera sees, at twice the size of the observation,
-2. the car's polygons on top,
-3. one area average down to 96 x 96,
-4. the indicator bar, put together from small pictures that pygame draws once and that are then kept.
+1. one affine warp of the texture to what the camera sees (`Ground.look`),
+2. the car on top, blended from four small pictures with a wheel each (`draw_car`),
+3. the indicator bar, put together from a picture of the score and one of each gauge (`draw_bar`).
+
+The small pictures are drawn when they are first needed, and kept: the camera is fixed to the car, so that a wheel looks
+the same whenever its angle and its rotation are.
 
 Physics, rewards, terminations, spaces and seeds are Gymnasium's own code, untouched: only `_render("state_pixels")` is
 replaced. This file is for whoever wants to know how a picture is made; to drive, `make_env()` is enough.
 """
 
 import functools
+import itertools
 import math
 import os
 
@@ -32,14 +35,31 @@ MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 TRACK_WIDTH = reference.TRACK_WIDTH  # half the width of the road, world units
 
 FAST_ID = "StadLab/CarRacing-v3"
-SUPERSAMPLE = 2  # the picture is drawn this many times too large, then averaged down
-TEXTURE_SCALE = 4.0  # texture pixels per world unit
-SHIFT = 4  # OpenCV's fixed-point polygons: coordinates carry this many binary digits behind the point
 DARKENING = 2  # pygame's smoothscale loses two levels of every channel to its fixed-point sums; so do we
+TEXTURE_SCALE = 3.0  # texture pixels (texels) per world unit: nearly two to a pixel of the observation
+TEXTURE_SIZE = round(2 * reference.PLAYFIELD * TEXTURE_SCALE)  # texels, width and height
+LEVELS = (1, 2, 4, 8, 16)  # how many times smaller each copy of the texture is
+TEXELS = 1.3  # the copy to look at has at least so many texels to a pixel, and less than twice as many
+SHIFT = 4  # OpenCV's fixed-point polygons: coordinates carry this many binary digits behind the point
 
-# The car's polygons in its own coordinates (world units), from Gymnasium's car_dynamics.
+# The car stands still in the picture, for the camera is fixed to it: the pixel corner where the hull's origin lies,
+# and the size of a quarter of the car, in pixels.
+HULL_ROW, HULL_COLUMN = 72, 48
+QUARTER_ROWS, QUARTER_COLUMNS = 6, 4
+CAR_AREA = (
+    slice(HULL_ROW - QUARTER_ROWS, HULL_ROW + QUARTER_ROWS),
+    slice(HULL_COLUMN - QUARTER_COLUMNS, HULL_COLUMN + QUARTER_COLUMNS),
+)
+QUARTERS = [
+    (slice(None), slice(row, row + QUARTER_ROWS), slice(column, column + QUARTER_COLUMNS))
+    for row in (0, QUARTER_ROWS)
+    for column in (0, QUARTER_COLUMNS)
+]
+FINE = 8  # a quarter is drawn so many times larger, then averaged down
+TURN_STEPS, PHASE_STEPS = 24, 32  # a wheel's angle to the hull and its rotation are drawn in steps of 1/24 and 2 pi/32
+
 HULL_POLYGONS = [
-    np.array(polygon) * car_dynamics.SIZE
+    np.array(polygon) * car_dynamics.SIZE  # world units
     for polygon in (
         car_dynamics.HULL_POLY1,
         car_dynamics.HULL_POLY2,
@@ -47,11 +67,14 @@ HULL_POLYGONS = [
         car_dynamics.HULL_POLY4,
     )
 ]
-WHEEL_POLYGON = (
-    np.array([(-1, 1), (1, 1), (1, -1), (-1, -1)]) * (car_dynamics.WHEEL_W, car_dynamics.WHEEL_R) * car_dynamics.SIZE
-)
 HULL_COLOR = (204, 0, 0)
-NOWHERE = np.full((4, 2), 1e4)  # world units from the car: never in the picture
+WHEEL_HALF_WIDTH, WHEEL_RADIUS = car_dynamics.WHEEL_W * car_dynamics.SIZE, car_dynamics.WHEEL_R * car_dynamics.SIZE
+
+# The gauges of the indicator bar: place in fortieths of the width, colour, and whether they grow upward or sideways.
+GAUGES = [(5, (255, 255, 255), True)]
+GAUGES += [(7, (0, 0, 255), True), (8, (0, 0, 255), True), (9, (51, 0, 255), True), (10, (51, 0, 255), True)]
+GAUGES += [(20, (0, 255, 0), False), (30, (255, 0, 0), False)]
+GAUGE_UNITS = [(reference.WINDOW_H if vertical else reference.WINDOW_W) / 40 for _, _, vertical in GAUGES]
 
 
 def make_env(fast: bool = True, **kwargs) -> gym.Env:
@@ -73,12 +96,21 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
 class FastCarRacing(reference.CarRacing):
     """CarRacing-v3 with a fast observation; everything else, `render()` too, is Gymnasium's.
 
-    Mean absolute difference to Gymnasium's observation: below 1 of 255 (tests/test_car_racing.py measures it).
+    Mean absolute difference to Gymnasium's observation: below 0.5 of 255 (tests/test_car_racing.py measures it).
+
+    Args:
+        bar: whether to draw the indicator bar. Without it the lowest 12 rows are black: for agents that crop it.
+        **kwargs: as for Gymnasium's CarRacing.
     """
 
+    def __init__(self, bar: bool = True, **kwargs):
+        super().__init__(**kwargs)
+        self._bar = bar
+        self._ground = Ground()
+
     def reset(self, *, seed: int | None = None, options: dict | None = None):
-        """As Gymnasium's reset. The texture of the last episode is dropped, the new one is painted on first sight."""
-        self._ground = None
+        """As Gymnasium's reset; the new track is painted on first sight."""
+        self._ground.painted = False
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.ndarray | None):
@@ -88,123 +120,165 @@ class FastCarRacing(reference.CarRacing):
         return super().step(action)
 
     def close(self):
-        """As Gymnasium's close, and lets go of the texture (20 MB), which reference cycles would keep for long."""
+        """As Gymnasium's close, and lets go of the texture (16 MB), which reference cycles would keep for long."""
         super().close()
-        self._ground = None
+        self._ground = Ground()
 
     def _render(self, mode: str):
         if mode != "state_pixels":
             return super()._render(mode)
-        if self._ground is None:
-            self._ground = Ground(self)
+        if not self._ground.painted:
+            self._ground.paint(self)
         self._ground.repaint_visited_tiles(self)
-        angle = self.car.hull.angle
         # The first second zooms in from the whole field to the car, as in Gymnasium.
         zoom = 0.1 * reference.SCALE * max(1 - self.t, 0) + reference.ZOOM * reference.SCALE * min(self.t, 1)
-        picture = self._ground.look(self.car.hull.position, angle, zoom)
-        draw_car(picture, self.car, zoom)
-        view = cv2.resize(picture, (OBSERVATION_SIZE, BAR_TOP), interpolation=cv2.INTER_AREA)
-        view = cv2.subtract(view, (DARKENING,) * 4)
-        return np.concatenate([view, indicator_bar(self.car, self.reward)])
+        observation = np.empty((OBSERVATION_SIZE, OBSERVATION_SIZE, 3), np.uint8)
+        view = observation[:BAR_TOP]
+        hull = self.car.hull
+        self._ground.look(view, hull.position, hull.angle, zoom)
+        draw_car(view, self.car, zoom)
+        if self._bar:
+            draw_bar(observation[BAR_TOP:], self.car, self.reward)
+        else:
+            observation[BAR_TOP:] = 0
+        return observation
 
 
 class Ground:
-    """The playfield of one episode (ground, grass, road, kerbs) as a texture, and the camera that looks at it.
+    """The playfield of an episode (ground, grass, road, kerbs) as a texture, and the camera that looks at it.
 
-    `levels` holds the texture at full, 1/4 and 1/16 scale: the opening zoom sees the whole field at once, and a
-    picture that shrinks the texture much must be read from a smaller copy, or thin roads would flicker.
+    `levels` holds the texture at full size and, down to a sixteenth, at half the size of the level before: the opening
+    zoom sees the whole field at once, and a picture that skips texels would let thin roads flicker.
     """
 
-    def __init__(self, env: reference.CarRacing):
-        size = round(2 * reference.PLAYFIELD * TEXTURE_SCALE)
-        texture = np.full((size, size, 3), [int(c) for c in env.bg_color], np.uint8)
-        grass = [int(c) for c in env.grass_color]
-        side = reference.GRASS_DIM * TEXTURE_SCALE
-        for row in range(0, 40, 2):
-            for column in range(0, 40, 2):
-                corner = (round(column * side), round(row * side))
-                opposite = (round((column + 1) * side) - 1, round((row + 1) * side) - 1)
-                cv2.rectangle(texture, corner, opposite, grass, cv2.FILLED)
-        for polygon, color in env.road_poly:
-            fill_road(texture, polygon, color)
-        self.levels = [texture]
-        for _ in range(2):
-            self.levels.append(cv2.resize(self.levels[-1], None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA))
-        self.tile_polygons = {
-            tile.idx: polygon
-            for tile, polygon in zip(env.road, (p for p, c in env.road_poly if isinstance(c, np.ndarray)), strict=True)
-        }
-        self.visited_count = 0
-        self.repainted: set[int] = set()
+    def __init__(self):
+        self.painted = False
+        self.levels = [np.zeros((TEXTURE_SIZE // shrink, TEXTURE_SIZE // shrink, 3), np.uint8) for shrink in LEVELS]
+
+    def paint(self, env: reference.CarRacing) -> None:
+        """Paint the track of a new episode over the last one."""
+        texture = self.levels[0]
+        np.copyto(texture, empty_field(tuple(darkened(env.bg_color)), tuple(darkened(env.grass_color))))
+        points = on_texture(np.array([polygon for polygon, _ in env.road_poly]))
+        for polygon, (_, color) in zip(points, env.road_poly, strict=True):
+            cv2.fillConvexPoly(texture, polygon, darkened(color), cv2.LINE_8, SHIFT)
+        for large, small in itertools.pairwise(self.levels):
+            cv2.resize(large, small.shape[:2], small, interpolation=cv2.INTER_AREA)
+        tiles = [isinstance(color, np.ndarray) for _, color in env.road_poly]  # the others are kerbs
+        self.tile_points = points[tiles]
+        self.tiles_seen = 0
+        self.painted = True
 
     def repaint_visited_tiles(self, env: reference.CarRacing) -> None:
         """Give tiles that the car has touched the plain road colour: new tiles differ by up to 5 levels."""
-        if env.tile_visited_count == self.visited_count:
-            return
-        self.visited_count = env.tile_visited_count
-        touched = {tile.idx for wheel in env.car.wheels for tile in wheel.tiles}
-        for index in touched - self.repainted:
-            fill_road(self.levels[0], self.tile_polygons[index], env.road_color)
-        self.repainted |= touched
+        if env.tile_visited_count != self.tiles_seen:
+            self.tiles_seen = env.tile_visited_count
+            for index in {tile.idx for wheel in env.car.wheels for tile in wheel.tiles}:
+                cv2.fillConvexPoly(self.levels[0], self.tile_points[index], darkened(env.road_color), cv2.LINE_8, SHIFT)
 
-    def look(self, position: tuple[float, float], angle: float, zoom: float) -> np.ndarray:
-        """What the camera sees above the indicator bar, at twice the observation's size: uint8 (168, 192, 3).
+    def look(self, view: np.ndarray, position: tuple[float, float], angle: float, zoom: float) -> None:
+        """Draw what the camera sees into `view`, uint8 (84, 96, 3): the observation above the indicator bar.
 
         Args:
             position: of the hull, world units; it stands in the middle, a quarter of the height above the lower edge.
             angle: of the hull, radians; the camera turns with it.
             zoom: window pixels (of 1000 x 800) per world unit.
         """
-        size = SUPERSAMPLE * OBSERVATION_SIZE
-        step_x = reference.WINDOW_W / size / zoom  # world units from one pixel of the picture to the next
-        step_y = reference.WINDOW_H / size / zoom
-        level = min(2, max(0, int(math.log(max(step_x * TEXTURE_SCALE / 1.5, 1), 4) + 0.5)))
-        texels = TEXTURE_SCALE / 4**level
-        cos, sin = math.cos(angle), math.sin(angle)
-        # Position of the picture's first pixel centre, relative to the hull, in the camera's axes (y points up).
-        right = 0.5 * step_x - reference.WINDOW_W / 2 / zoom
-        up = 0.75 * reference.WINDOW_H / zoom - 0.5 * step_y
-        x = position[0] + cos * right - sin * up + reference.PLAYFIELD
-        y = position[1] + sin * right + cos * up + reference.PLAYFIELD
-        matrix = np.array(
-            [
-                [cos * step_x * texels, sin * step_y * texels, x * texels - 0.5],
-                [sin * step_x * texels, -cos * step_y * texels, y * texels - 0.5],
-            ]
-        )
+        step_x, step_y = reference.WINDOW_W / 96 / zoom, reference.WINDOW_H / 96 / zoom  # world units to a pixel
+        level = min(len(LEVELS) - 1, int(math.log2(max(1, step_x * TEXTURE_SCALE / TEXELS))))
+        texels = TEXTURE_SCALE / LEVELS[level]
+        cos, sin = math.cos(angle) * texels, math.sin(angle) * texels
+        # From the first pixel's centre to the hull, in the camera's axes.
+        right, up = (0.5 - HULL_COLUMN) * step_x, (HULL_ROW - 0.5) * step_y
+        x = (position[0] + reference.PLAYFIELD) * texels + cos * right - sin * up - 0.5
+        y = (position[1] + reference.PLAYFIELD) * texels + sin * right + cos * up - 0.5
+        matrix = np.array(((cos * step_x, sin * step_y, x), (sin * step_x, -cos * step_y, y)))
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        shape = (size, SUPERSAMPLE * BAR_TOP)
-        return cv2.warpAffine(self.levels[level], matrix, shape, flags=flags, borderMode=cv2.BORDER_CONSTANT)
+        cv2.warpAffine(self.levels[level], matrix, (OBSERVATION_SIZE, BAR_TOP), view, flags)
 
 
-def fill_road(texture: np.ndarray, polygon: list[tuple[float, float]], color) -> None:
-    """Fill one tile of road or kerb; `polygon` in world units."""
-    points = to_fixed_point((np.array(polygon) + reference.PLAYFIELD) * TEXTURE_SCALE)
-    cv2.fillConvexPoly(texture, points, [int(c) for c in color], cv2.LINE_8, SHIFT)
+def darkened(color) -> list[int]:
+    """A colour of Gymnasium's as it comes out of pygame's smoothscale."""
+    return [max(0, int(c) - DARKENING) for c in color]
 
 
-def draw_car(picture: np.ndarray, car: car_dynamics.Car, zoom: float) -> None:
-    """Draw wheels, their light marks and the hull into `picture` (168, 192, 3), seen by the camera of `Ground.look`."""
-    scale, middle = camera(zoom)
-    turn = np.array([wheel.angle - car.hull.angle for wheel in car.wheels])
-    cos, sin = np.cos(turn), np.sin(turn)
-    rotation = np.array([[cos, -sin], [sin, cos]]).transpose(2, 0, 1)
-    offset = np.array([car.hull.GetLocalPoint(wheel.position) for wheel in car.wheels])
-    marks = [wheel_mark(wheel.phase) for wheel in car.wheels]
-    corners = np.array([np.concatenate([WHEEL_POLYGON, mark]) for mark in marks])
-    corners = corners @ rotation.transpose(0, 2, 1) + offset[:, None]
-    for corner in to_fixed_point(corners * scale + middle):
-        cv2.fillConvexPoly(picture, corner[:4], car_dynamics.WHEEL_COLOR, cv2.LINE_8, SHIFT)
-        cv2.fillConvexPoly(picture, corner[4:], car_dynamics.WHEEL_WHITE, cv2.LINE_8, SHIFT)
-    for polygon in hull_polygons(zoom):
-        cv2.fillConvexPoly(picture, polygon, HULL_COLOR, cv2.LINE_8, SHIFT)
+def on_texture(polygons: np.ndarray) -> np.ndarray:
+    """Polygons (..., 2) in world units as OpenCV wants them on the texture."""
+    return to_fixed_point((polygons + reference.PLAYFIELD) * TEXTURE_SCALE)
 
 
-def camera(zoom: float) -> tuple[np.ndarray, np.ndarray]:
-    """How hull coordinates (world units, y forward) become pixels of the picture: (factors, position of the hull)."""
-    size = SUPERSAMPLE * OBSERVATION_SIZE
-    scale = np.array([size / reference.WINDOW_W, -size / reference.WINDOW_H]) * zoom
-    return scale, np.array([size / 2, 0.75 * size])
+@functools.lru_cache(maxsize=1)
+def empty_field(ground: tuple[int, ...], grass: tuple[int, ...]) -> np.ndarray:
+    """Ground and grass without a road."""
+    texture = np.full((TEXTURE_SIZE, TEXTURE_SIZE, 3), ground, np.uint8)
+    side = reference.GRASS_DIM * TEXTURE_SCALE
+    for row in range(0, 40, 2):
+        for column in range(0, 40, 2):
+            corner = (round(column * side), round(row * side))
+            opposite = (round((column + 1) * side) - 1, round((row + 1) * side) - 1)
+            cv2.rectangle(texture, corner, opposite, grass, cv2.FILLED)
+    return texture
+
+
+def draw_car(view: np.ndarray, car: car_dynamics.Car, zoom: float) -> None:
+    """Draw the car into `view` (84, 96, 3), four quarters with a wheel each, as the camera of `Ground.look` sees it."""
+    angle = car.hull.angle
+    overlay = np.empty((2, 2 * QUARTER_ROWS, 2 * QUARTER_COLUMNS, 3), np.float32)
+    for place, wheel in enumerate(car.wheels):
+        turn = round((wheel.angle - angle) * TURN_STEPS)
+        phase = int(wheel.phase * PHASE_STEPS / math.tau) % PHASE_STEPS
+        overlay[QUARTERS[place]] = quarter_picture(place, turn, phase, zoom)
+    area = view[CAR_AREA]
+    area[:] = area * overlay[0] + overlay[1]
+
+
+def rectangle(half_width: float, low: float, high: float) -> np.ndarray:
+    """Corners of a rectangle around the y axis, (4, 2)."""
+    return np.array([(-half_width, high), (half_width, high), (half_width, low), (-half_width, low)])
+
+
+@functools.lru_cache(maxsize=10_000)  # pictures of 0.6 kB
+def quarter_picture(place: int, turn: int, phase: int, zoom: float) -> np.ndarray:
+    """A quarter of the car with one wheel.
+
+    Args:
+        place: of the wheel: front left, front right, rear left, rear right.
+        turn: its angle to the hull in 1/24 radian, positive to the left.
+        phase: its rotation in 1/32 of a turn.
+        zoom: as in `Ground.look`.
+
+    Returns:
+        float32 (2, 6, 4, 3): by what to multiply the ground, and what to add to it.
+    """
+    angle = turn / TURN_STEPS
+    rotation = np.array([(math.cos(angle), math.sin(angle)), (-math.sin(angle), math.cos(angle))])
+    middle = np.array(car_dynamics.WHEELPOS[place]) * car_dynamics.SIZE
+    shapes = [(rectangle(WHEEL_HALF_WIDTH, -WHEEL_RADIUS, WHEEL_RADIUS) @ rotation + middle, car_dynamics.WHEEL_COLOR)]
+    mark = wheel_mark((phase + 0.5) * math.tau / PHASE_STEPS)
+    if mark:
+        shapes.append((rectangle(WHEEL_HALF_WIDTH, *mark) @ rotation + middle, car_dynamics.WHEEL_WHITE))
+    shapes += [(polygon, HULL_COLOR) for polygon in HULL_POLYGONS]
+    rows, columns = FINE * QUARTER_ROWS, FINE * QUARTER_COLUMNS
+    scale = zoom * FINE * OBSERVATION_SIZE / np.array([reference.WINDOW_W, -reference.WINDOW_H])
+    corner = np.array([columns * (place % 2 == 0), rows * (place < 2)])
+    canvas = np.zeros((rows, columns, 4), np.uint8)  # red, green, blue, and how much of the ground is covered
+    for polygon, color in shapes:
+        cv2.fillConvexPoly(canvas, to_fixed_point(polygon * scale + corner), [*darkened(color), 255], cv2.LINE_8, SHIFT)
+    small = cv2.resize(canvas, (QUARTER_COLUMNS, QUARTER_ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return np.stack([np.repeat(1 - small[..., 3:] / 255, 3, axis=2), small[..., :3] + 0.5])  # + 0.5: rounds, not cuts
+
+
+def wheel_mark(phase: float) -> tuple[float, float] | None:
+    """The light stripe on a turning wheel, from where to where along the wheel; None while it is underneath."""
+    sin1, sin2 = math.sin(phase), math.sin(phase + 1.2)
+    cos1, cos2 = math.cos(phase), math.cos(phase + 1.2)
+    if sin1 > 0 and sin2 > 0:
+        return None
+    if sin1 > 0:
+        cos1 = math.copysign(1, cos1)
+    if sin2 > 0:
+        cos2 = math.copysign(1, cos2)
+    return cos2 * WHEEL_RADIUS, cos1 * WHEEL_RADIUS
 
 
 def to_fixed_point(points: np.ndarray) -> np.ndarray:
@@ -212,85 +286,51 @@ def to_fixed_point(points: np.ndarray) -> np.ndarray:
     return np.round((points - 0.5) * 2**SHIFT).astype(np.int32)
 
 
-@functools.lru_cache(maxsize=64)
-def hull_polygons(zoom: float) -> list[np.ndarray]:
-    """The hull as it stands in the picture: always the same but for the zoom, because the camera is fixed to it."""
-    scale, middle = camera(zoom)
-    return [to_fixed_point(polygon * scale + middle) for polygon in HULL_POLYGONS]
+def draw_bar(bar: np.ndarray, car: car_dynamics.Car, reward: float) -> None:
+    """Draw the score and seven gauges into `bar`, uint8 (12, 96, 3): speed, wheel speeds, steering angle, yaw rate."""
+    values = [0.02 * math.hypot(*car.hull.linearVelocity)]
+    values += [0.01 * wheel.omega for wheel in car.wheels]
+    values += [-10.0 * car.wheels[0].joint.angle, -0.8 * car.hull.angularVelocity]
+    bar[:] = score_picture(f"{reward:04.0f}")
+    for number, (value, unit) in enumerate(zip(values, GAUGE_UNITS, strict=True)):
+        np.maximum(bar, gauge_picture(number, round(max(-40.0, min(40.0, value)) * unit)), out=bar)
 
 
-def wheel_mark(phase: float) -> np.ndarray:
-    """The light stripe on a turning wheel, (4, 2) in the wheel's coordinates; outside the picture while underneath."""
-    sin1, sin2 = math.sin(phase), math.sin(phase + 1.2)
-    cos1, cos2 = math.cos(phase), math.cos(phase + 1.2)
-    if sin1 > 0 and sin2 > 0:
-        return NOWHERE
-    if sin1 > 0:
-        cos1 = math.copysign(1, cos1)
-    if sin2 > 0:
-        cos2 = math.copysign(1, cos2)
-    corners = np.array([(-1, cos1), (1, cos1), (1, cos2), (-1, cos2)])
-    return corners * (car_dynamics.WHEEL_W, car_dynamics.WHEEL_R) * car_dynamics.SIZE
-
-
-def indicator_bar(car: car_dynamics.Car, reward: float) -> np.ndarray:
-    """The lowest 12 rows, uint8 (12, 96, 3): score, speed, four wheel speeds, steering angle and yaw rate."""
-    bar = score_picture(f"{reward:04.0f}").copy()
-    speed = math.hypot(*car.hull.linearVelocity)
-    blue, violet = (0, 0, 255), (51, 0, 255)
-    gauges = [(5, 0.02 * speed, (255, 255, 255), True)]
-    gauges += [
-        (place, 0.01 * wheel.omega, blue if place < 9 else violet, True) for place, wheel in enumerate(car.wheels, 7)
-    ]
-    gauges.append((20, -10.0 * car.wheels[0].joint.angle, (0, 255, 0), False))
-    gauges.append((30, -0.8 * car.hull.angularVelocity, (255, 0, 0), False))
-    for place, value, color, vertical in gauges:
-        unit = reference.WINDOW_H / 40 if vertical else reference.WINDOW_W / 40
-        pixels = round(max(-40.0, min(40.0, value)) * unit)
-        if pixels:
-            left, patch = gauge_picture(place, pixels, color, vertical)
-            area = bar[:, left : left + patch.shape[1]]
-            np.maximum(area, patch, out=area)
-    return bar
-
-
-def _shrink_bar(surface: pygame.Surface) -> np.ndarray:
+def shrink_bar(surface: pygame.Surface) -> np.ndarray:
     """Shrink a 1000 x 100 drawing of the bar to uint8 (12, 96, 3), as Gymnasium shrinks its window."""
     small = pygame.transform.smoothscale(surface, (OBSERVATION_SIZE, OBSERVATION_SIZE - BAR_TOP))
-    return pygame.surfarray.array3d(small).transpose(1, 0, 2)
+    return np.ascontiguousarray(pygame.surfarray.array3d(small).transpose(1, 0, 2))
 
 
-def _bar_surface() -> pygame.Surface:
-    # Depth 24 without alpha, as Gymnasium's window has where there is no display.
+def bar_surface() -> pygame.Surface:
+    """The bar in Gymnasium's window; depth 24 without alpha, as the window has where there is no display."""
     return pygame.Surface((reference.WINDOW_W, reference.WINDOW_H // 8), depth=24)
 
 
 @functools.lru_cache(maxsize=4096)
 def score_picture(text: str) -> np.ndarray:
-    """The bar with nothing but the score: uint8 (12, 96, 3), drawn by pygame once for each text."""
+    """The bar with nothing but the score: uint8 (12, 96, 3)."""
     pygame.font.init()
-    surface = _bar_surface()
+    surface = bar_surface()
     label = pygame.font.Font(pygame.font.get_default_font(), 42).render(text, True, (255, 255, 255), (0, 0, 0))
     middle = reference.WINDOW_H * (5 - 2.5) / 40
     surface.blit(label, label.get_rect(center=(60, middle)))
-    return _shrink_bar(surface)
+    return shrink_bar(surface)
 
 
 @functools.lru_cache(maxsize=4096)
-def gauge_picture(place: int, pixels: int, color: tuple[int, int, int], vertical: bool) -> tuple[int, np.ndarray]:
-    """One gauge of the bar, `pixels` long in the window: (its first column, uint8 (12, columns, 3))."""
-    surface = _bar_surface()
+def gauge_picture(number: int, length: int) -> np.ndarray:
+    """The bar with nothing but gauge `number`, `length` pixels long in the window: uint8 (12, 96, 3)."""
+    place, color, vertical = GAUGES[number]
+    surface = bar_surface()
     s, h, bottom = reference.WINDOW_W / 40, reference.WINDOW_H / 40, reference.WINDOW_H / 8
     if vertical:
-        x1, x2, y1, y2 = place * s, (place + 1) * s, bottom - h - pixels, bottom - h
+        x1, x2, y1, y2 = place * s, (place + 1) * s, bottom - h - length, bottom - h
     else:
-        x1, x2, y1, y2 = place * s, place * s + pixels, bottom - 4 * h, bottom - 2 * h
-    pygame.draw.polygon(surface, color, [(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
-    patch = _shrink_bar(surface)
-    columns = np.flatnonzero(patch.any(axis=(0, 2)))
-    if not len(columns):
-        return 0, patch[:, :0]
-    return int(columns[0]), np.ascontiguousarray(patch[:, columns[0] : columns[-1] + 1])
+        x1, x2, y1, y2 = place * s, place * s + length, bottom - 4 * h, bottom - 2 * h
+    if length:
+        pygame.draw.polygon(surface, color, [(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
+    return shrink_bar(surface)
 
 
 def place_car(env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, offset: float = 0.0) -> np.ndarray:
