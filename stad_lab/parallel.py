@@ -3,9 +3,12 @@
 Any `concurrent.futures.Executor` serves; this is the one a laptop has built in.
 """
 
+import ctypes
 import multiprocessing
 import os
+import platform
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -13,6 +16,8 @@ from contextlib import contextmanager
 
 import cv2
 import torch
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # from glibc's malloc.h
 
 
 @contextmanager
@@ -39,8 +44,32 @@ def worker_processes(count: int) -> Iterator[ProcessPoolExecutor]:
         executor.shutdown(cancel_futures=True)
 
 
+def keep_freed_memory() -> None:
+    """Tell the C library to keep the memory that this process frees, instead of giving it back to the system.
+
+    A batch's arrays have the sizes of the batch before. Without this, Linux hands out and clears the same pages again
+    in every step, which costs a fifth of V's training time. Elsewhere than on Linux with glibc nothing happens.
+    """
+    if sys.platform == "linux" and platform.libc_ver()[0] == "glibc":
+        library = ctypes.CDLL(None)
+        library.mallopt(M_MMAP_THRESHOLD, 2**30)
+        library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def peak_memory() -> dict[str, float] | None:
+    """The most memory, in MB, that this process and the largest of its ended workers have held; None on Windows."""
+    if sys.platform == "win32":
+        return None
+    import resource  # is not there on Windows
+
+    unit = 1e6 if sys.platform == "darwin" else 1e3  # bytes there, kilobytes on Linux
+    who = {"process": resource.RUSAGE_SELF, "worker": resource.RUSAGE_CHILDREN}
+    return {name: round(resource.getrusage(kind).ru_maxrss / unit, 1) for name, kind in who.items()}
+
+
 def start_worker() -> None:
     """Prepare a worker process."""
+    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)

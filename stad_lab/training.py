@@ -12,6 +12,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
+from stad_lab.parallel import keep_freed_memory
 
 RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
@@ -41,6 +42,7 @@ def fit(
         ValueError: the checkpoint belongs to another model or is damaged.
         FloatingPointError: the loss is not finite.
     """
+    keep_freed_memory()
     optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate)
     history = load_state(checkpoint, model, optimizer) if checkpoint.exists() else []
     start, sums = history[-1]["step"] if history else 0, {}
