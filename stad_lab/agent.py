@@ -62,7 +62,7 @@ class Agent:
         """
         return self.act_batch([observation])[0]
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def act_batch(self, observations: np.ndarray | list[np.ndarray]) -> np.ndarray:
         """The actions for cars that drive in step: uint8 (cars, 96, 96, 3) -> float32 (cars, 3).
 
@@ -117,7 +117,8 @@ def drive(
     Returns:
         The returns, float64 (tracks,), and the lengths in frames, int (tracks,).
     """
-    envs = [make_env(fast) for _ in tracks]
+    unseen = {"bar": False} if fast and agent.crop_bar else {}  # what V crops need not be drawn
+    envs = [make_env(fast, **unseen) for _ in tracks]
     observations = [env.reset(seed=track)[0] for env, track in zip(envs, tracks, strict=True)]
     returns, lengths = np.zeros(len(tracks)), np.zeros(len(tracks), int)
     last_tile = np.zeros(len(tracks), int)  # the frame in which a car last reached a new tile

@@ -4,6 +4,7 @@ Official means Gymnasium's own CarRacing-v3 with its own renderer, whole episode
 training nor validation ever touches. Each track is named by its seed, so anyone can drive it again.
 """
 
+import time
 from pathlib import Path
 
 import numpy as np
@@ -38,7 +39,7 @@ def evaluate(
 
     Returns:
         A dict for JSON: "mean", "standard_deviation", "interval" (95%, of the mean), "above_900" (share of episodes),
-        and for every episode its "track", "return" and "frames".
+        "seconds" that it took, and for every episode its "track", "return" and "frames".
 
     Raises:
         ValueError: tracks outside the range that is kept for tests, or an agent that cannot be loaded.
@@ -52,6 +53,7 @@ def evaluate(
         )
     agent = load_agent(variant, path)
     folder = run_folder(variant, path)
+    begin = time.perf_counter()
     tracks = list(range(first_track, first_track + episodes))
     with worker_processes(processes) as executor:
         # One car at a time: in a batch the last bits differ, and a script that drives alone should get these numbers.
@@ -63,6 +65,7 @@ def evaluate(
         "renderer": "fast" if fast else "official",
         "controller_sha256": checksum(folder / "controller.safetensors"),
         **summarise(returns),
+        "seconds": time.perf_counter() - begin,
         "episodes": [
             {"track": track, "return": float(value), "frames": int(length)}
             for track, value, length in zip(tracks, returns, frames, strict=True)

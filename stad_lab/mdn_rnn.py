@@ -38,7 +38,7 @@ class Mixture(NamedTuple):
 class MDNRNN(nn.Module):
     """M: latents and actions -> the distribution of the next latents.
 
-    One step and a whole sequence run the same code: a step is a sequence of length one.
+    A step is a sequence of length one.
 
     Args:
         latent_size: dimensions of z.
@@ -70,7 +70,12 @@ class MDNRNN(nn.Module):
 
     def remember(self, latents: torch.Tensor, actions: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
         """The memory without the prediction: h after every step (batch, time, hidden_size), and the state."""
-        return self.lstm(torch.cat([latents, actions], dim=2), state)
+        inputs = torch.cat([latents, actions], dim=2)
+        if inputs.shape[1] > 1 or state is None:
+            return self.lstm(inputs, state)
+        # A single step, as in driving: nn.LSTM's preparations for a sequence take longer than the step itself.
+        hidden, cell = torch.lstm_cell(inputs[:, 0], (state[0][0], state[1][0]), *self.lstm.all_weights[0])
+        return hidden[:, None], (hidden[None], cell[None])
 
     def mixture(self, hidden: torch.Tensor) -> Mixture:
         """The head: h (batch, time, hidden_size) -> the mixture it stands for."""
@@ -120,8 +125,7 @@ def check_temperature(temperature: float) -> None:
 def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -> list[np.ndarray]:
     """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
     encoded = []
-    for mapped in tqdm(rollouts.frames, "encode", unit="episode"):
-        frames = np.array(mapped)  # into memory: torch takes no read-only arrays
+    for frames in tqdm(rollouts.frames, "encode", unit="episode"):
         count = max(1, len(frames) // 250)
         pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
         parts = [torch.stack(autoencoder.encode(*to_pictures(*pair))) for pair in pairs]

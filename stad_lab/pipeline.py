@@ -5,7 +5,8 @@ autoencoder.safetensors       V
 mdn_rnn.safetensors           M
 evolution.json                every generation of CMA-ES
 controller.safetensors        C: the CMA mean that drove the validation tracks best
-record.json                   variant, settings, versions, commit, and the time and budget of every stage
+record.json                   variant, settings, versions, commit, and the time (in seconds), the most memory that a
+                              process has held so far (in MB) and the budget of every stage
 """
 
 import importlib.metadata
@@ -23,6 +24,7 @@ from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoenco
 from stad_lab.checkpoints import load_json, load_tensors, save_json, save_tensors
 from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
+from stad_lab.parallel import peak_memory
 from stad_lab.rollouts import collect_rollouts
 from stad_lab.settings import Settings, check_same_run
 
@@ -72,6 +74,7 @@ def train(
         finally:
             if did:
                 record["seconds"][stage] = record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
+                record.setdefault("peak_memory", {})[stage] = peak_memory()
                 save_json(folder / "record.json", record)
         print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
         worked |= did

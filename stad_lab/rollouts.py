@@ -2,12 +2,14 @@
 
 A folder of rollouts holds one block for each episode, `00042.frames.npy` (uint8) and `00042.actions.npy` (float32), and
 `manifest.json` with the settings, and for each block its track, length and checksums. A block enters the manifest only
-when it is complete on disk, so an interrupted collection goes on where it stopped. Blocks are read memory-mapped: a
-dataset may be larger than the memory.
+when it is complete on disk, so an interrupted collection goes on where it stopped. Frames are read when they are needed
+and not kept: a dataset may be larger than the memory (at `paper` settings it has 12 GB).
 """
 
 import io
+import shutil
 import time
+from collections.abc import Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
 
@@ -28,6 +30,8 @@ TRACK_RANGES = {
     "evolve": (2_000_000, 3_000_000),
     "validate": (3_000_000, 4_000_000),
 }
+NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array's shape is short
+FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
 COLLECT_FIELDS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
 
 
@@ -67,7 +71,7 @@ def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarr
     """
     track = track_seeds("collect", settings.episodes, settings.seed)[index]
     rng = np.random.default_rng([settings.seed, index])
-    env = make_env(fast=True)
+    env = make_env(fast=True, bar=not settings.crop_bar)
     observation, _ = env.reset(seed=track)
     if rng.random() < settings.random_starts:
         observation = place_car(
@@ -114,6 +118,7 @@ def collect_rollouts(settings: Settings, folder: Path) -> bool:
 
     Raises:
         ValueError: the folder holds rollouts of other settings.
+        OSError: the disk has not enough room for them.
     """
     folder = Path(folder)
     wanted = {field: getattr(settings, field) for field in COLLECT_FIELDS}
@@ -129,6 +134,7 @@ def collect_rollouts(settings: Settings, folder: Path) -> bool:
     if not missing:
         return False
     folder.mkdir(parents=True, exist_ok=True)
+    check_disk(folder, len(missing) * settings.episode_frames * FRAME_BYTES)
     for left_over in folder.glob(".*.part"):
         if time.time() - left_over.stat().st_mtime > 60:  # a younger one may be in another run's hands
             left_over.unlink(missing_ok=True)
@@ -142,11 +148,45 @@ def collect_rollouts(settings: Settings, folder: Path) -> bool:
     return True
 
 
+def check_disk(folder: Path, needed: int) -> None:
+    """Say how much of the disk `needed` bytes are, and raise OSError, before any work, if so much is not free."""
+    free = shutil.disk_usage(folder).free
+    room = f"rollouts: up to {needed / 1e9:.2f} GB in {folder}, where {free / 1e9:.2f} GB are free"
+    if needed > free:
+        raise OSError(f"{room}: free some room, choose a folder on another disk, or collect fewer or shorter episodes")
+    print(room)
+
+
+class EpisodeFrames(Sequence):
+    """The frames of every episode, uint8 (T, 64, 64, 3) each, read from the disk when asked for and not kept.
+
+    Memory-mapped files would be shorter to write, but all that was ever touched of them counts as the process's memory.
+    """
+
+    def __init__(self, paths: list[Path]):
+        self.paths = paths
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        return np.load(self.paths[index], allow_pickle=False)
+
+    def read(self, index: int, moments: list[int]) -> list[bytes]:
+        """Single frames of episode `index`, as the bytes of uint8 (64, 64, 3)."""
+        with self.paths[index].open("rb", buffering=0) as file:
+            frames = []
+            for moment in moments:
+                file.seek(NPY_HEADER + moment * FRAME_SIZE**2 * 3)
+                frames.append(file.read(FRAME_SIZE**2 * 3))
+            return frames
+
+
 class Rollouts:
-    """The dataset in a folder, read-only and memory-mapped.
+    """The dataset in a folder, read-only.
 
     Attributes:
-        frames: one uint8 array (T, 64, 64, 3) for each episode.
+        frames: one uint8 array (T, 64, 64, 3) for each episode, read from the disk at every access.
         actions: one float32 array (T, 3) for each episode.
 
     Raises:
@@ -161,11 +201,12 @@ class Rollouts:
         found, wanted = len(self.manifest["blocks"]), self.manifest["settings"]["episodes"]
         if found != wanted:
             raise ValueError(f"{self.folder} holds {found} of {wanted} episodes: {remedy}")
-        self.frames, self.actions = [], []
-        for entry in self.manifest["blocks"]:
-            self.frames.append(self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8))
-            self.actions.append(self._read(entry, "actions", (entry["frames"], 3), np.float32))
-        lengths = [len(frames) for frames in self.frames]
+        blocks = self.manifest["blocks"]
+        for entry in blocks:
+            self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        self.frames = EpisodeFrames([block_path(self.folder, entry["index"], "frames") for entry in blocks])
+        self.actions = [self._read(entry, "actions", (entry["frames"], 3), np.float32).copy() for entry in blocks]
+        lengths = [entry["frames"] for entry in blocks]
         self.episode = np.repeat(np.arange(len(lengths)), lengths)  # of every frame in the dataset
         self.moment = np.concatenate([np.arange(length) for length in lengths])  # its index in that episode
 
@@ -181,7 +222,7 @@ class Rollouts:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
         if array.shape != shape or array.dtype != dtype:
             raise ValueError(f"{path} holds {array.dtype} {array.shape}, the manifest says {shape}: {remedy}")
-        return np.asarray(array)  # a plain view on the map: much faster to index than numpy.memmap
+        return array
 
     def __len__(self) -> int:
         return len(self.episode)
@@ -189,9 +230,11 @@ class Rollouts:
     def pairs(self, indices: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
         """Frames and the frames to subtract from them, for indices into the whole dataset: two uint8 (n, 64, 64, 3)."""
         episodes, moments = self.episode[indices], self.moment[indices]
-        frames = np.stack([self.frames[e][t] for e, t in zip(episodes, moments, strict=True)])
-        before = earlier_index(moments, stride)
-        return frames, np.stack([self.frames[e][t] for e, t in zip(episodes, before, strict=True)])
+        wanted = zip(episodes, moments, earlier_index(moments, stride), strict=True)
+        both = zip(*(self.frames.read(episode, moments) for episode, *moments in wanted), strict=True)
+        shape = (len(indices), FRAME_SIZE, FRAME_SIZE, 3)
+        frames, earlier = (np.frombuffer(bytearray().join(part), np.uint8).reshape(shape) for part in both)
+        return frames, earlier
 
     def split(self, heldout: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
         """Indices of training frames and of held-out frames: whole episodes, the last ones, at least one."""

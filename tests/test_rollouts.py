@@ -1,9 +1,8 @@
-"""The random driver's dataset: complete, checked, memory-mapped, and the same after any interrupt."""
+"""The random driver's dataset: complete, checked, of any size, and the same after any interrupt."""
 
 import hashlib
 import itertools
 import json
-import mmap
 import shutil
 import signal
 import subprocess
@@ -13,8 +12,17 @@ import time
 import numpy as np
 import pytest
 
+from stad_lab.checkpoints import checksum, save_json
 from stad_lab.frames import difference_image, episode_differences
-from stad_lab.rollouts import TRACK_RANGES, RandomDriver, Rollouts, collect_rollouts, drive_randomly, track_seeds
+from stad_lab.rollouts import (
+    TRACK_RANGES,
+    RandomDriver,
+    Rollouts,
+    block_path,
+    collect_rollouts,
+    drive_randomly,
+    track_seeds,
+)
 from stad_lab.settings import Settings
 
 MANY = {"episodes": 24, "episode_frames": 30}
@@ -101,18 +109,58 @@ def test_a_block_can_be_driven_again(quick_run):
     assert track == rollouts.manifest["blocks"][3]["track"]
 
 
-def test_frames_are_memory_mapped_uint8(quick_run):
+def test_frames_are_uint8_and_actions_float32(quick_run):
     rollouts = Rollouts(quick_run / "rollouts")
     for frames, actions in zip(rollouts.frames, rollouts.actions, strict=True):
         assert frames.dtype == np.uint8
         assert frames.shape[1:] == (64, 64, 3)
         assert actions.dtype == np.float32
         assert actions.shape == (len(frames), 3)
-        owner = frames
-        while isinstance(owner, np.ndarray):
-            owner = owner.base
-        assert isinstance(owner, mmap.mmap)
-        assert not frames.flags.writeable
+
+
+READ_ALL = """
+import sys
+import numpy as np
+from pathlib import Path
+from stad_lab.parallel import peak_memory
+from stad_lab.rollouts import Rollouts
+
+before = peak_memory()["process"]
+rollouts = Rollouts(Path(sys.argv[1]))
+for indices in np.array_split(np.arange(len(rollouts)), 100):
+    rollouts.pairs(indices, stride=4)
+total = sum(frames.nbytes for frames in rollouts.frames)
+print(total / 1e6, peak_memory()["process"] - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not tell a process's peak memory")
+def test_reading_a_dataset_takes_little_memory_however_large_it_is(tmp_path):
+    episodes, length = 50, 400
+    blocks = []
+    for index in range(episodes):
+        entry = {"index": index, "track": index, "frames": length}
+        for name, array in [("frames", np.zeros((length, 64, 64, 3), np.uint8)), ("actions", np.zeros((length, 3)))]:
+            path = block_path(tmp_path, index, name)
+            np.save(path, array.astype(np.uint8 if name == "frames" else np.float32))
+            entry[f"{name}_sha256"] = checksum(path)
+        blocks.append(entry)
+    save_json(tmp_path / "manifest.json", {"settings": {"episodes": episodes}, "blocks": blocks})
+    process = subprocess.run([sys.executable, "-c", READ_ALL, tmp_path], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stderr
+    megabytes, grown = map(float, process.stdout.split())
+    assert megabytes > 200
+    assert grown < 40
+
+
+def test_a_collection_says_its_size_on_the_disk_and_starts_only_if_there_is_room(tmp_path, capsys):
+    collect_rollouts(Settings.preset("quick", **MANY), tmp_path / "small")
+    assert f"up to 0.01 GB in {tmp_path / 'small'}, where " in capsys.readouterr().out
+    size = sum(file.stat().st_size for file in (tmp_path / "small").glob("*.npy"))
+    assert size == pytest.approx(24 * 30 * (64 * 64 * 3 + 12), rel=0.02)
+    with pytest.raises(OSError, match=r"up to 1230000\.00 GB in .* GB are free: free some room, choose a folder on another"):
+        collect_rollouts(Settings.preset("quick", episodes=1_000_000, episode_frames=100_000), tmp_path / "huge")
+    assert not any((tmp_path / "huge").iterdir())
 
 
 def test_pairs_are_the_frames_of_the_difference_images(quick_run):
