@@ -1,4 +1,4 @@
-"""The command line: python -m stad_lab train | evaluate | film | ship."""
+"""The command line: python -m stad_lab train | evaluate | benchmark | film | ship."""
 
 import argparse
 import dataclasses
@@ -9,6 +9,7 @@ from pathlib import Path
 
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import VARIANTS
+from stad_lab.benchmark import PARTS, benchmark
 from stad_lab.checkpoints import save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
 from stad_lab.film import film_agent
@@ -69,6 +70,18 @@ def build_parser() -> argparse.ArgumentParser:
     )
 
     command = commands.add_parser(
+        "benchmark",
+        help="measure speeds side by side with Gymnasium and EnvPool",
+        description="Let the fast renderer, the loop and the training take turns with the usual ways to do the same"
+        " work; about eight minutes on a machine that does nothing else. EnvPool takes part if it is installed.",
+    )
+    command.add_argument(
+        "--part", action="append", choices=list(PARTS), help="only this part; may be repeated; default all"
+    )
+    command.add_argument("--rounds", type=int, default=5, help="how often the contenders take turns, default 5")
+    command.add_argument("--json", type=Path, default=Path("benchmark.json"), help="where to write every measurement")
+
+    command = commands.add_parser(
         "ship", parents=[variant], help="copy a run's weights and records to stad_lab/pretrained"
     )
     command.add_argument("--path", type=Path, required=True, help="folder of the run")
@@ -119,6 +132,9 @@ def main(arguments: list[str] | None = None) -> int:
             save_json(file, result)
             print(describe(result))
             print(f"  every episode: {file}")
+        elif options.command == "benchmark":
+            save_json(options.json, benchmark(options.part or list(PARTS), options.rounds))
+            print(f"\nevery measurement: {options.json}")
         elif options.command == "ship":
             print(f"shipped to {ship(options.variant, options.path)}")
         elif options.command == "film":

@@ -106,11 +106,11 @@ class FastCarRacing(reference.CarRacing):
     def __init__(self, bar: bool = True, **kwargs):
         super().__init__(**kwargs)
         self._bar = bar
-        self._ground = Ground()
+        self.ground = Ground()
 
     def reset(self, *, seed: int | None = None, options: dict | None = None):
         """As Gymnasium's reset; the new track is painted on first sight."""
-        self._ground.painted = False
+        self.ground.painted = False
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.ndarray | None):
@@ -122,26 +122,30 @@ class FastCarRacing(reference.CarRacing):
     def close(self):
         """As Gymnasium's close, and lets go of the texture (16 MB), which reference cycles would keep for long."""
         super().close()
-        self._ground = Ground()
+        self.ground = Ground()
 
     def _render(self, mode: str):
         if mode != "state_pixels":
             return super()._render(mode)
-        if not self._ground.painted:
-            self._ground.paint(self)
-        self._ground.repaint_visited_tiles(self)
-        # The first second zooms in from the whole field to the car, as in Gymnasium.
-        zoom = 0.1 * reference.SCALE * max(1 - self.t, 0) + reference.ZOOM * reference.SCALE * min(self.t, 1)
+        if not self.ground.painted:
+            self.ground.paint(self)
+        self.ground.repaint_visited_tiles(self)
+        zoom = camera_zoom(self.t)
         observation = np.empty((OBSERVATION_SIZE, OBSERVATION_SIZE, 3), np.uint8)
         view = observation[:BAR_TOP]
         hull = self.car.hull
-        self._ground.look(view, hull.position, hull.angle, zoom)
+        self.ground.look(view, hull.position, hull.angle, zoom)
         draw_car(view, self.car, zoom)
         if self._bar:
             draw_bar(observation[BAR_TOP:], self.car, self.reward)
         else:
             observation[BAR_TOP:] = 0
         return observation
+
+
+def camera_zoom(t: float) -> float:
+    """Window pixels (of 1000 x 800) for a world unit, t seconds after the start: the first second zooms in."""
+    return 0.1 * reference.SCALE * max(1 - t, 0) + reference.ZOOM * reference.SCALE * min(t, 1)
 
 
 class Ground:
@@ -153,10 +157,13 @@ class Ground:
 
     def __init__(self):
         self.painted = False
-        self.levels = [np.zeros((TEXTURE_SIZE // shrink, TEXTURE_SIZE // shrink, 3), np.uint8) for shrink in LEVELS]
+        self.levels: list[np.ndarray] = []  # 16 MB, so only when there is something to paint
 
     def paint(self, env: reference.CarRacing) -> None:
         """Paint the track of a new episode over the last one."""
+        if not self.levels:
+            sizes = [TEXTURE_SIZE // shrink for shrink in LEVELS]
+            self.levels = [np.empty((size, size, 3), np.uint8) for size in sizes]
         texture = self.levels[0]
         np.copyto(texture, empty_field(tuple(darkened(env.bg_color)), tuple(darkened(env.grass_color))))
         points = on_texture(np.array([polygon for polygon, _ in env.road_poly]))

@@ -95,7 +95,7 @@ def open_record(folder: Path, variant: str, settings: Settings) -> dict:
         record = {
             "variant": variant,
             "settings": settings.as_dict(),
-            "made_with": provenance(variant, settings),
+            "made_with": provenance(command_of(variant, settings)),
             "seconds": {},
         }
         save_json(path, record)
@@ -114,8 +114,8 @@ def command_of(variant: str, settings: Settings) -> str:
     return " ".join([f"python -m stad_lab train --variant {variant} --settings {settings.name} --out ...", *changes])
 
 
-def provenance(variant: str, settings: Settings) -> dict:
-    """What the run was made with: versions, machine, and the commit if the code lies in a git checkout."""
+def provenance(command: str) -> dict:
+    """What a run was made with: versions, machine, command, and the commit if the code lies in a git checkout."""
     changes = git("status", "--porcelain", "--untracked-files=no", "--", ".")
     return {
         "python": platform.python_version(),
@@ -124,7 +124,7 @@ def provenance(variant: str, settings: Settings) -> dict:
         "cores": os.cpu_count(),
         "commit": git("rev-parse", "HEAD"),
         "uncommitted_changes": changes if changes is None else bool(changes),
-        "command": command_of(variant, settings),
+        "command": command,
     }
 
 

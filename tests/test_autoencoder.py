@@ -7,6 +7,7 @@ import torch
 from stad_lab.autoencoder import (
     VARIANTS,
     AutoEncoder,
+    FromOnePixel,
     autoencoder_losses,
     load_autoencoder,
     save_autoencoder,
@@ -29,6 +30,19 @@ def make_batch(count=3, seed=0):
     rng = np.random.default_rng(seed)
     frames, earlier = rng.integers(0, 256, (2, count, 64, 64, 3), np.uint8)
     return *to_pictures(frames, earlier), torch.from_numpy(rng.standard_normal((count, 32), np.float32))
+
+
+def test_the_decoder_s_first_layer_is_a_transposed_convolution():
+    torch.manual_seed(0)
+    ours, general = FromOnePixel(8, 6, 5), torch.nn.ConvTranspose2d(8, 6, 5)
+    general.load_state_dict(ours.state_dict())
+    pixels, wanted = torch.randn(3, 8, 1, 1), torch.randn(3, 6, 5, 5)
+    for layer in (ours, general):
+        (layer(pixels) * wanted).sum().backward()
+    assert ours(pixels).shape == (3, 6, 5, 5)
+    assert torch.allclose(ours(pixels), general(pixels), atol=1e-6)
+    assert torch.allclose(ours.weight.grad, general.weight.grad, atol=1e-6)
+    assert torch.allclose(ours.bias.grad, general.bias.grad, atol=1e-6)
 
 
 @pytest.mark.parametrize(

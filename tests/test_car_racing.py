@@ -7,6 +7,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from stad_lab import make_env
+from stad_lab.benchmark import compare_pictures
 from stad_lab.car_racing import BAR_TOP, MAX_FRAMES, place_car
 
 STRAIGHT = np.array([0, 1, 0], np.float32)
@@ -108,6 +109,15 @@ def test_rewards_equal_to_the_last_bit_to_the_end_of_a_lap():
     assert_equal_to_the_last_bit(fast, official)
 
 
+def test_pictures_of_20_episodes_are_gymnasium_s_to_half_a_level_and_around_the_car_to_four():
+    episodes = [compare_pictures(number, frames=60) for number in range(20)]
+    assert all(equal for _, equal in episodes)
+    whole, window, bar = np.concatenate([errors for errors, _ in episodes]).mean(axis=0)
+    assert whole <= 0.5
+    assert window <= 4
+    assert bar <= 0.5
+
+
 def test_pictures_differ_by_less_than_one_level_in_the_opening_zoom():
     fast, official = drive_both(follow_road, 21, 50)
     errors = differences([step[0] for step in fast], [step[0] for step in official])
@@ -178,6 +188,37 @@ def test_spaces_are_those_of_car_racing(fast):
     assert env.action_space.low.tolist() == [-1, 0, 0]
     assert env.action_space.high.tolist() == [1, 1, 1]
     assert env.spec.max_episode_steps == MAX_FRAMES
+
+
+def test_without_the_bar_only_the_bar_is_missing():
+    whole, cropped = make_env(), make_env(bar=False)
+    pictures = [[env.reset(seed=29)[0], *(env.step(STRAIGHT)[0] for _ in range(20))] for env in (whole, cropped)]
+    for with_bar, without in zip(*pictures, strict=True):
+        assert np.array_equal(with_bar[:BAR_TOP], without[:BAR_TOP])
+        assert with_bar[BAR_TOP:].any()
+        assert not without[BAR_TOP:].any()
+
+
+def test_an_observation_belongs_to_whoever_got_it():
+    env, other = make_env(), make_env()
+    env.reset(seed=30)
+    other.reset(seed=30)
+    for _ in range(5):
+        observation = env.step(STRAIGHT)[0]
+        assert np.array_equal(observation, other.step(STRAIGHT)[0])
+        observation[:] = 0  # must not reach the pictures that the environment keeps
+
+
+def test_two_environments_do_not_paint_over_each_other():
+    alone = make_env()
+    expected = [alone.reset(seed=31)[0], *(alone.step(STRAIGHT)[0] for _ in range(60))]
+    one, two = make_env(), make_env()
+    seen = [one.reset(seed=31)[0]]
+    two.reset(seed=32)
+    for _ in range(60):
+        seen.append(one.step(STRAIGHT)[0])
+        two.step(STRAIGHT)
+    assert np.array_equal(seen, expected)
 
 
 def test_render_gives_the_same_large_picture():

@@ -4,6 +4,7 @@ import dataclasses
 import importlib.metadata
 import json
 import shutil
+import sys
 
 import numpy as np
 import pytest
@@ -70,6 +71,9 @@ def test_a_run_leaves_weights_log_and_record(quick_training):
     assert record["variant"] == "input_output"
     assert Settings.from_dict(record["settings"]) == PRESETS["quick"]
     assert record["seconds"].keys() == {"rollouts", "autoencoder", "mdn_rnn", "controller"}
+    assert record["peak_memory"].keys() == record["seconds"].keys()
+    if sys.platform != "win32":
+        assert all(50 < peak < 3000 for stage in record["peak_memory"].values() for peak in stage.values())
     assert record["made_with"]["torch"] == importlib.metadata.version("torch")
     assert record["budget"]["random"] == {"episodes": 8, "frames": 8 * 60}
     assert record["budget"]["agents"] == record["budget"]["evolution"]["episodes"] == 4 * 4
@@ -96,6 +100,7 @@ def test_the_second_run_of_a_command_does_nothing_and_says_so(run, command_line)
             ["--variant", "--settings", "--out", "--rollouts", "--until", "--set", *VARIANTS, *PRESETS, "mdn_rnn"],
         ),
         ("evaluate", ["--variant", "--path", "--episodes", "--first-track", "--fast", "--processes", "--json"]),
+        ("benchmark", ["--part", "--rounds", "--json", "parity", "renderer", "loop", "training"]),
         ("ship", ["--variant", "--path"]),
         ("film", ["--variant", "--path", "--out", "--track", "--first", "--frames"]),
     ],
@@ -118,7 +123,7 @@ def test_help_names_every_setting(capsys):
 def test_the_first_help_names_every_command(command_line):
     process = command_line("--help")
     assert process.returncode == 0
-    for command in ("train", "evaluate", "ship", "film"):
+    for command in ("train", "evaluate", "benchmark", "ship", "film"):
         assert command in process.stdout
 
 

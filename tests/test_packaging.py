@@ -26,6 +26,7 @@ ROOMS = [
     "evolution",
     "evaluation",
     "pipeline",
+    "benchmark",
     "plots",
     "film",
     "widgets",

@@ -1,0 +1,430 @@
+"""The benchmark: how fast the parts are, side by side, in one run on one machine.
+
+    parity      how far the fast picture is from Gymnasium's, on 20 episodes, and whether the rewards are equal
+    renderer    frames a second on one core: Gymnasium, EnvPool if it is installed, and the fast renderer
+    loop        frames a second with V + M + C driving, and where the time of a frame goes
+    training    V and M trained the plain way and in ours, from the same weights on the same batches
+
+A speed says more about a machine than about a program, so every part has a contender that does the same work in the
+usual way. The contenders take turns, in alternating order, and the median of the rounds counts. It takes about eight
+minutes, and they should be quiet ones: whatever else runs is measured too.
+"""
+
+import dataclasses
+import functools
+import importlib.util
+import multiprocessing
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Executor, ProcessPoolExecutor
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+from torch.utils.data import DataLoader, Dataset
+from tqdm.auto import tqdm
+
+from stad_lab.agent import PRETRAINED, Agent, drive, load_agent, load_world_model
+from stad_lab.autoencoder import AutoEncoder, autoencoder_losses, save_autoencoder, to_pictures
+from stad_lab.car_racing import BAR_TOP, HULL_COLUMN, HULL_ROW, MAX_FRAMES, make_env, place_car
+from stad_lab.controller import control
+from stad_lab.evolution import drive_parallel
+from stad_lab.frames import FrameMemory, to_frame
+from stad_lab.mdn_rnn import MDNRNN, mdn_loss
+from stad_lab.parallel import keep_freed_memory, worker_processes
+from stad_lab.pipeline import provenance
+from stad_lab.rollouts import RandomDriver, Rollouts, collect_rollouts, track_seeds
+from stad_lab.settings import Settings
+
+V_STEPS, M_STEPS, WARM_UP = 40, 10, 4  # training steps of a round, and how many of them are not timed
+VARIANT = "input"  # of the shipped agent that drives
+GYMNASIUM, FAST, PHYSICS, ENVPOOL = "Gymnasium", "stad_lab", "physics alone, no picture", "EnvPool"
+CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))
+
+
+def benchmark(parts: Iterable[str], rounds: int = 5) -> dict:
+    """Run some parts of the benchmark and print their tables.
+
+    Args:
+        parts: of "parity", "renderer", "loop", "training".
+        rounds: how often the contenders take turns.
+
+    Returns:
+        A dict for JSON: what it was made with, and for each part its tables with every single measurement.
+
+    Raises:
+        ValueError: an unknown part, or fewer than 1 round.
+    """
+    unknown = [part for part in parts if part not in PARTS]
+    if unknown or rounds < 1:
+        raise ValueError(
+            f"parts={unknown or list(parts)}, rounds={rounds}: choose from {', '.join(PARTS)}, with 1 round or more"
+        )
+    result = {"made_with": provenance("python -m stad_lab benchmark"), "rounds": rounds}
+    result["made_with"]["instructions"] = torch.backends.cpu.get_cpu_capability()
+    for part in parts:
+        result[part] = PARTS[part](rounds)
+        print(f"\n{part}")
+        for name, table in result[part].items():
+            print(describe(name, table))
+    return result
+
+
+def take_turns(contenders: dict[str, Callable[[int], float]], rounds: int, label: str) -> dict:
+    """Let contenders take turns: a table of their speeds, in every round and the median, and ratios to the first one.
+
+    Args:
+        contenders: name -> function of the round's number that returns a speed.
+    """
+    speeds = {name: [] for name in contenders}
+    for number in tqdm(range(rounds), label, unit="round"):
+        for name in list(contenders)[:: -1 if number % 2 else 1]:
+            speeds[name].append(contenders[name](number))
+    medians = {name: float(np.median(values)) for name, values in speeds.items()}
+    first = next(iter(medians.values()))
+    return {
+        name: {"median": median, "ratio": median / first, "rounds": speeds[name]} for name, median in medians.items()
+    }
+
+
+def describe(name: str, table: dict) -> str:
+    """A table as lines of text."""
+    lines = [f"  {name}"]
+    for row, value in table.items():
+        if isinstance(value, dict):
+            lines.append(f"    {row:<44}{value['median']:>10,.0f}{value['ratio']:>8.2f}x")
+        else:
+            lines.append(f"    {row:<44}{value:>10,.3f}" if isinstance(value, float) else f"    {row:<44}{value!s:>10}")
+    return "\n".join(lines)
+
+
+# Parity
+
+
+def measure_parity(rounds: int) -> dict:
+    """Drive 20 whole episodes in both environments, on and off the road."""
+    with worker_processes(2) as executor:
+        episodes = list(tqdm(executor.map(compare_pictures, range(20)), "parity", 20, unit="episode"))
+    names = ("whole picture", "window of 24 x 24 around the car", "indicator bar")
+    errors = np.concatenate([errors for errors, _ in episodes])
+    table = {f"{name}, mean": float(mean) for name, mean in zip(names, errors.mean(axis=0), strict=True)}
+    table |= {f"{name}, worst frame": float(worst) for name, worst in zip(names, errors.max(axis=0), strict=True)}
+    table |= {"frames compared": len(errors), "rewards and endings equal": all(equal for _, equal in episodes)}
+    return {"mean absolute difference between the pictures, of 255": table}
+
+
+def compare_pictures(number: int, frames: int = MAX_FRAMES) -> tuple[np.ndarray, bool]:
+    """One random episode in both environments, the odd ones from a random tile: are they the same?
+
+    Returns:
+        Mean absolute differences (pictures, 3) of the whole picture, the window around the car and the indicator bar,
+        and whether all rewards, terminations and truncations were equal to the last bit.
+    """
+    rng = np.random.default_rng([5, number])
+    driver, envs = RandomDriver(rng), [make_env(fast) for fast in (True, False)]
+    pictures = [[env.reset(seed=track_seeds("test", 20, 5)[number])[0]] for env in envs]
+    if number % 2:
+        start = {"tile": int(rng.integers(10_000)), "speed": rng.uniform(0, 90), "turn": 0.15 * rng.standard_normal()}
+        pictures = [[place_car(env, **start)] for env in envs]
+    equal = True
+    for _ in range(frames):
+        action = driver.act()
+        steps = [env.step(action) for env in envs]
+        equal &= steps[0][1:] == steps[1][1:]
+        for seen, step in zip(pictures, steps, strict=True):
+            seen.append(step[0])
+        if any(steps[0][2:4]) or any(steps[1][2:4]):
+            break
+    difference = np.abs(np.array(pictures[0], np.int16) - np.array(pictures[1], np.int16))
+    areas = [difference, difference[:, *CAR_WINDOW], difference[:, BAR_TOP:]]
+    return np.stack([area.mean(axis=(1, 2, 3)) for area in areas], axis=1), equal
+
+
+# The renderer
+
+
+def measure_renderer(rounds: int) -> dict:
+    """Frames a second on one core, whole random episodes, resets included."""
+    cv2.setNumThreads(1)
+    physics = make_env()
+    nothing = np.zeros((96, 96, 3), np.uint8)
+    physics.unwrapped._render = lambda mode: nothing.copy()
+    envs = {GYMNASIUM: make_env(fast=False), FAST: make_env(), PHYSICS: physics}
+    contenders = {name: lambda number, env=env: random_episodes(env, number) for name, env in envs.items()}
+    if importlib.util.find_spec("envpool"):
+        import envpool  # optional: pip install envpool
+
+        pool = envpool.make_gymnasium("CarRacing-v3", num_envs=1, num_threads=1, seed=0)
+        contenders[ENVPOOL] = lambda number: pool_episode(pool, number)
+    else:
+        print("EnvPool is not installed and takes no part; to have it in: pip install envpool")
+    for contender in contenders.values():  # a warm-up: caches fill, memory is taken
+        contender(rounds)
+    return {"frames a second on one core": take_turns(contenders, rounds, "renderer")}
+
+
+def random_actions(number: int) -> np.ndarray:
+    """The random driver's actions for one episode, float32 (1000, 3): it soon leaves the road."""
+    driver = RandomDriver(np.random.default_rng(number))
+    return np.array([driver.act() for _ in range(MAX_FRAMES)])
+
+
+def random_episodes(env, number: int, seconds: float = 1.0) -> float:
+    """Frames a second of whole episodes, driven until so many seconds have passed."""
+    actions, frames, episodes, begin = random_actions(number), 0, 0, time.perf_counter()
+    while time.perf_counter() - begin < seconds:
+        env.reset(seed=100 * number + episodes)
+        episodes += 1
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            frames += 1
+            if terminated or truncated:
+                break
+    return frames / (time.perf_counter() - begin)
+
+
+def pool_episode(pool, number: int) -> float:
+    """Frames a second of EnvPool, which resets itself: as many frames as an episode has, one reset among them."""
+    actions, begin = random_actions(number)[:, None], time.perf_counter()
+    for action in actions:
+        pool.step(action)
+    return len(actions) / (time.perf_counter() - begin)
+
+
+# The loop
+
+
+def measure_loop(rounds: int) -> dict:
+    """A generation of 8 agents at `paper` settings against Gymnasium alone, the cost of more cars, and of one frame."""
+    settings = Settings.preset("paper")
+    folder, agent = PRETRAINED / VARIANT, load_agent(VARIANT)
+    rng = np.random.default_rng(0)
+    population = agent.parameters + 0.01 * rng.standard_normal((settings.population, agent.parameters.size))
+    with tempfile.TemporaryDirectory() as large, worker_processes(1) as one, worker_processes(2) as two:
+        make_world_models_sizes(Path(large))
+
+        def generation(executor: Executor, where: Path, number: int) -> float:
+            tracks = track_seeds("evolve", settings.tracks, 9, number) * settings.population
+            return parallel_speed(executor, where, population, tracks, settings)
+
+        contenders = {
+            "Gymnasium alone, no agent, 2 processes": lambda number: gymnasium_speed(two, number),
+            "8 agents, shipped V + M + C, 2 processes": lambda number: generation(two, folder, number),
+            "8 agents, shipped V + M + C, 1 process": lambda number: generation(one, folder, number),
+            "8 agents, World Models' sizes, 2 processes": lambda number: generation(two, Path(large), number),
+        }
+        for contender in contenders.values():
+            contender(rounds)
+        tables = {"frames a second, a generation": take_turns(contenders, rounds, "loop")}
+        short = dataclasses.replace(settings, max_frames=250, cars=32)
+        crowds = {
+            f"{cars} in step": lambda number, cars=cars: parallel_speed(
+                one, folder, np.repeat(agent.parameters[None], cars, axis=0), list(range(cars)), short
+            )
+            for cars in (1, 2, 4, 8, 16, 32)
+        }
+        tables["frames a second, cars in one process"] = take_turns(crowds, rounds, "cars")
+        for cars in (4, 16):
+            budgets = [one.submit(frame_budget, cars).result() for _ in range(rounds)]
+            tables[f"microseconds of a frame, {cars} cars in one process"] = {
+                part: float(np.median([budget[part] for budget in budgets])) for part in budgets[0]
+            }
+    return tables
+
+
+def make_world_models_sizes(folder: Path) -> None:
+    """A V of World Models' width, untrained, beside the shipped M: its speed is that of a trained one."""
+    settings = Settings.preset("paper")
+    autoencoder = AutoEncoder(VARIANT, settings.latent_size, settings.width)
+    save_autoencoder(folder / "autoencoder.safetensors", autoencoder, settings, [])
+    shutil.copyfile(PRETRAINED / VARIANT / "mdn_rnn.safetensors", folder / "mdn_rnn.safetensors")
+
+
+def parallel_speed(
+    executor: Executor, folder: Path, agents: np.ndarray, tracks: list[int], settings: Settings
+) -> float:
+    """Frames a second of all agents together, each on its track."""
+    begin = time.perf_counter()
+    _, lengths = drive_parallel(executor, folder, VARIANT, agents, tracks, settings)
+    return lengths.sum() / (time.perf_counter() - begin)
+
+
+def gymnasium_speed(executor: Executor, number: int) -> float:
+    """Frames a second of Gymnasium's own environment in two processes together, random driving, no agent."""
+    futures = [executor.submit(gymnasium_episode, 2 * number + process) for process in range(2)]
+    return sum(future.result() for future in futures)
+
+
+def gymnasium_episode(number: int) -> float:
+    """Frames a second of one random episode in Gymnasium's own environment. Runs in a worker process."""
+    return random_episodes(make_env(fast=False), number)
+
+
+def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
+    """Microseconds that each part takes for one frame of one car, of `cars` in step. Runs in a worker process.
+
+    Parts are timed one by one, on what the shipped agent sees; "all else" is what a real drive takes beyond their sum.
+    """
+    folder = PRETRAINED / VARIANT
+    autoencoder, mdn_rnn, stride, _ = load_world_model(folder, VARIANT)
+    agent = load_agent(VARIANT)
+    parameters = np.repeat(agent.parameters[None], cars, axis=0)
+    crowd = Agent(autoencoder, mdn_rnn, parameters, stride)
+    drive(crowd, list(range(cars)), max_frames=50)
+    begin = time.perf_counter()
+    _, lengths = drive(crowd, list(range(cars)), max_frames=frames)
+    whole = (time.perf_counter() - begin) / lengths.sum()
+
+    env, blind = make_env(bar=False), make_env(bar=False)
+    observation = env.reset(seed=0)[0]
+    blind.unwrapped._render = lambda mode: np.zeros_like(observation)
+    actions = []
+    for _ in range(frames):
+        actions.append(agent.act(observation))
+        observation = env.step(actions[-1])[0]
+    seconds = {"reset": seconds_of(lambda: env.reset(seed=0), 10) / frames}
+    blind.reset(seed=0)
+    left = iter(actions)
+    seconds["physics"] = seconds_of(lambda: blind.step(next(left)), frames)
+    seconds["picture"] = seconds_of(lambda: env.unwrapped._render("state_pixels"), frames)
+    memory, observations = FrameMemory(stride), [observation] * cars
+
+    def prepare():
+        frames = np.stack([to_frame(observation) for observation in observations])
+        return to_pictures(frames, memory.push(frames))
+
+    with torch.inference_mode():
+        seconds["preparation"] = seconds_of(prepare, frames // 4) / cars
+        pictures = prepare()
+        seconds["V"] = seconds_of(lambda: autoencoder.encode(*pictures), frames // 4) / cars
+        latents, chosen = torch.zeros(cars, 1, mdn_rnn.latent_size), torch.zeros(cars, 1, 3)
+        state = tuple(torch.zeros(1, cars, mdn_rnn.hidden_size) for _ in range(2))
+        seconds["M"] = seconds_of(lambda: mdn_rnn.remember(latents, chosen, state), frames // 4) / cars
+    features = np.zeros((cars, mdn_rnn.latent_size + mdn_rnn.hidden_size), np.float32)
+    seconds["C"] = seconds_of(lambda: control(parameters, features), frames // 4) / cars
+    seconds["all else"] = whole - sum(seconds.values())
+    return {name: 1e6 * value for name, value in {**seconds, "together": whole}.items()}
+
+
+def seconds_of(call: Callable, count: int) -> float:
+    """Mean seconds of one of `count` calls."""
+    begin = time.perf_counter()
+    for _ in range(count):
+        call()
+    return (time.perf_counter() - begin) / count
+
+
+# Training
+
+
+def measure_training(rounds: int) -> dict:
+    """V and M trained the plain way and in ours, each in a fresh process with all cores."""
+    tables = {}
+    with tempfile.TemporaryDirectory() as folder:
+        collect_rollouts(Settings.preset("laptop", episodes=100), Path(folder))
+        for width in (16, 32):
+            losses = {"plain": [], FAST: []}
+
+            def train(name: str, number: int, width: int = width, losses: dict = losses) -> float:
+                speed, loss = in_fresh_process(train_v, name == "plain", width, Path(folder), number)
+                losses[name].append(loss)
+                return speed
+
+            contenders = {name: functools.partial(train, name) for name in losses}
+            tables[f"images a second, V of width {width}"] = take_turns(contenders, rounds, f"V of width {width}")
+            tables[f"held-out loss after {V_STEPS} steps, V of width {width}"] = {
+                name: float(np.mean(values)) for name, values in losses.items()
+            }
+    contenders = {name: functools.partial(in_fresh_process, train_m, name == "plain") for name in ("plain", FAST)}
+    return tables | {"frames a second, M at paper settings": take_turns(contenders, rounds, "M")}
+
+
+def in_fresh_process(function: Callable, *arguments):
+    """What `function` returns in a new Python process: memory that one contender keeps must not help the next one."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as executor:
+        return executor.submit(function, *arguments).result()
+
+
+class Pictures(Dataset):
+    """The rollouts as the plain way reads them: one frame with its difference image at a time."""
+
+    def __init__(self, rollouts: Rollouts, stride: int):
+        self.rollouts, self.stride = rollouts, stride
+
+    def __len__(self) -> int:
+        return len(self.rollouts)
+
+    def __getitem__(self, index: int) -> tuple[torch.Tensor, torch.Tensor]:
+        frame, difference = to_pictures(*self.rollouts.pairs(np.array([index]), self.stride))
+        return frame[0].contiguous(), difference[0].contiguous()
+
+
+def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STEPS) -> tuple[float, float]:
+    """Train V for a few steps: (images a second, held-out loss after them).
+
+    Plain is what a tutorial would write: a Dataset of single pictures, a DataLoader, PyTorch's layers and memory order.
+    Ours is what `autoencoder.train_autoencoder` does. Weights, batches and noise are the same.
+    """
+    settings = Settings.preset("laptop", width=width)
+    rollouts = Rollouts(folder)
+    training, heldout = rollouts.split()
+    torch.manual_seed(seed)
+    autoencoder = AutoEncoder(VARIANT, settings.latent_size, width)
+    rng = np.random.default_rng(seed)
+    batches = [np.sort(rng.choice(training, settings.v_batch)) for _ in range(steps)]
+    noise = torch.from_numpy(rng.standard_normal((steps, settings.v_batch, settings.latent_size), np.float32))
+    if plain:
+        layer = autoencoder.decoder[2]
+        autoencoder.decoder[2] = nn.ConvTranspose2d(layer.in_channels, layer.out_channels, layer.kernel_size)
+        autoencoder.decoder[2].load_state_dict(layer.state_dict())
+        pictures = DataLoader(Pictures(rollouts, settings.stride), batch_sampler=batches)
+    else:
+        keep_freed_memory()
+        autoencoder.to(memory_format=torch.channels_last)
+        pictures = (to_pictures(*rollouts.pairs(batch, settings.stride)) for batch in batches)
+    optimizer = torch.optim.Adam(autoencoder.parameters(), lr=settings.v_learning_rate)
+    for step, (frame, difference) in enumerate(pictures):
+        if step == WARM_UP:
+            begin = time.perf_counter()
+        loss = autoencoder_losses(autoencoder, frame, difference, noise[step], settings)["total"]
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    speed = (steps - WARM_UP) * settings.v_batch / (time.perf_counter() - begin)
+    with torch.no_grad():
+        frame, difference = to_pictures(*rollouts.pairs(heldout[:500], settings.stride))
+        zero = torch.zeros(len(frame), settings.latent_size)
+        return speed, autoencoder_losses(autoencoder, frame, difference, zero, settings)["total"].item()
+
+
+def train_m(plain: bool, seed: int, steps: int = M_STEPS, batch: int | None = None) -> float:
+    """Frames a second of M in training; ours differs only in keeping freed memory. The data are noise: speed is all."""
+    if not plain:
+        keep_freed_memory()
+    settings = Settings.preset("paper")
+    batch = batch or settings.m_batch
+    torch.manual_seed(seed)
+    mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
+    latents = torch.randn(batch, settings.m_sequence + 1, settings.latent_size)
+    actions = torch.randn(batch, settings.m_sequence, 3)
+    optimizer = torch.optim.Adam(mdn_rnn.parameters(), lr=settings.m_learning_rate)
+    for step in range(steps):
+        if step == WARM_UP:
+            begin = time.perf_counter()
+        mixture, _ = mdn_rnn(latents[:, :-1], actions)
+        optimizer.zero_grad()
+        mdn_loss(mixture, latents[:, 1:]).backward()
+        optimizer.step()
+    return (steps - WARM_UP) * batch * settings.m_sequence / (time.perf_counter() - begin)
+
+
+PARTS = {
+    "parity": measure_parity,
+    "renderer": measure_renderer,
+    "loop": measure_loop,
+    "training": measure_training,
+}

@@ -1,0 +1,66 @@
+"""The benchmark: fair turns, parts that add up, contenders that compute the same; the speeds are its own business."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stad_lab.benchmark import FAST, GYMNASIUM, PHYSICS, benchmark, describe, frame_budget, take_turns, train_m, train_v
+from stad_lab.rollouts import collect_rollouts
+from stad_lab.settings import Settings
+
+
+def test_contenders_take_turns_in_alternating_order():
+    calls = []
+
+    def contender(name, speed):
+        def run(number):
+            calls.append((number, name))
+            return speed * (1 + number)
+
+        return run
+
+    table = take_turns({"slow": contender("slow", 10), "quick": contender("quick", 30)}, 3, "test")
+    assert calls == [(0, "slow"), (0, "quick"), (1, "quick"), (1, "slow"), (2, "slow"), (2, "quick")]
+    assert table["slow"] == {"median": 20, "ratio": 1, "rounds": [10, 20, 30]}
+    assert table["quick"] == {"median": 60, "ratio": 3, "rounds": [30, 60, 90]}
+    assert "60    3.00x" in describe("frames a second", table)
+
+
+def test_the_parts_of_a_frame_add_up_to_the_whole():
+    budget = frame_budget(cars=2, frames=40)
+    whole = budget.pop("together")
+    assert sum(budget.values()) == pytest.approx(whole)
+    assert {"physics", "picture", "preparation", "V", "M", "C"} < budget.keys()
+    assert all(value > 0 for name, value in budget.items() if name != "all else")
+
+
+def test_the_plain_way_and_ours_train_the_same_v(tmp_path):
+    collect_rollouts(Settings.preset("quick"), tmp_path)
+    (_, plain), (_, ours) = (train_v(way, 8, tmp_path, seed=0, steps=8) for way in (True, False))
+    (_, other) = train_v(False, 8, tmp_path, seed=1, steps=8)
+    assert ours == pytest.approx(plain, rel=1e-4)
+    assert ours != pytest.approx(other, rel=1e-4)
+
+
+def test_m_s_speed_is_measured():
+    assert np.isfinite(train_m(True, seed=0, steps=6, batch=4))
+
+
+def test_the_command_writes_every_measurement(tmp_path, command_line):
+    process = command_line("benchmark", "--part", "renderer", "--rounds", 1, "--json", tmp_path / "benchmark.json")
+    assert process.returncode == 0, process.stderr
+    result = json.loads((tmp_path / "benchmark.json").read_text())
+    table = result["renderer"]["frames a second on one core"]
+    assert {GYMNASIUM, FAST, PHYSICS} <= table.keys()
+    assert all(len(row["rounds"]) == 1 and row["median"] > 0 for row in table.values())
+    assert table[FAST]["ratio"] > 1
+    assert result["made_with"]["command"] == "python -m stad_lab benchmark"
+    assert f"{FAST}  " in process.stdout
+    assert ("EnvPool is not installed" in process.stdout) == ("EnvPool" not in table)
+
+
+@pytest.mark.parametrize(("parts", "rounds"), [(["speed"], 5), (["parity"], 0)])
+def test_an_unknown_part_or_no_round_is_refused(parts, rounds):
+    with pytest.raises(ValueError, match=r"choose from parity, renderer, loop, training, with 1 round or more"):
+        benchmark(parts, rounds)
