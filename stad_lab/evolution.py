@@ -8,6 +8,7 @@ eigendecomposition depend on the number of threads.
 """
 
 import dataclasses
+import math
 import zlib
 from concurrent.futures import Executor
 from pathlib import Path
@@ -157,11 +158,11 @@ def drive_parallel(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode for each row of `parameters` (episodes, parameters): (returns, lengths in frames).
 
-    They drive in groups of `settings.cars`, under its max_frames and patience. The groups do not depend on how many
-    processes share them, so neither do the numbers.
+    They drive in two groups or more, of at most `settings.cars`, under its max_frames and patience. The groups do not
+    depend on how many processes share them, so neither do the numbers.
     """
-    starts = range(0, len(tracks), settings.cars)
-    groups = [slice(start, start + settings.cars) for start in starts]
+    size = min(settings.cars, math.ceil(len(tracks) / 2))
+    groups = [slice(start, start + size) for start in range(0, len(tracks), size)]
     futures = [
         executor.submit(drive_group, folder, variant, parameters[group], tracks[group], True, settings)
         for group in groups

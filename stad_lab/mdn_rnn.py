@@ -18,7 +18,7 @@ from stad_lab.checkpoints import load_into, load_tensors, save_tensors
 from stad_lab.frames import earlier_frames
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
-from stad_lab.training import fit
+from stad_lab.training import fit, training_device
 
 ACTION_SIZE = 3
 LOGSIGMA_RANGE = (-5.0, 3.0)  # a narrower Gaussian would let the likelihood run away on a single latent
@@ -124,12 +124,12 @@ def check_temperature(temperature: float) -> None:
 @torch.no_grad()
 def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -> list[np.ndarray]:
     """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
-    encoded = []
+    encoded, device = [], next(autoencoder.parameters()).device
     for frames in tqdm(rollouts.frames, "encode", unit="episode"):
         count = max(1, len(frames) // 250)
         pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
-        parts = [torch.stack(autoencoder.encode(*to_pictures(*pair))) for pair in pairs]
-        encoded.append(torch.cat(parts, dim=1).numpy())
+        parts = [torch.stack(autoencoder.encode(*to_pictures(*pair, device))) for pair in pairs]
+        encoded.append(torch.cat(parts, dim=1).cpu().numpy())
     return encoded
 
 
@@ -172,15 +172,17 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     check_facts(v_path, v_facts, settings)
     rollouts = Rollouts(rollouts_folder)
     torch.manual_seed(settings.seed)
-    mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
-    encoded = encode_rollouts(autoencoder, rollouts, settings.stride)
+    device = training_device()
+    mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)
+    encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
     first_heldout = rollouts.episode[rollouts.split()[1][0]]
 
     def losses_on(episodes: slice, batch: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
         latents, actions = sequence_batch(
             encoded[episodes], rollouts.actions[episodes], settings.m_sequence, batch, rng
         )
-        mixture, _ = mdn_rnn(latents[:, :-1], actions)
+        latents = latents.to(device)
+        mixture, _ = mdn_rnn(latents[:, :-1], actions.to(device))
         return {"total": mdn_loss(mixture, latents[:, 1:])}
 
     def batch_losses(step: int) -> dict[str, torch.Tensor]:

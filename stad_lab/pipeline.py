@@ -27,6 +27,7 @@ from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory
 from stad_lab.rollouts import collect_rollouts
 from stad_lab.settings import Settings, check_same_run
+from stad_lab.training import training_device
 
 STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
@@ -122,6 +123,7 @@ def provenance(command: str) -> dict:
         **{package: importlib.metadata.version(package) for package in PACKAGES},
         "platform": f"{platform.system()} {platform.machine()}",
         "cores": os.cpu_count(),
+        "trained_on": str(training_device()),
         "commit": git("rev-parse", "HEAD"),
         "uncommitted_changes": changes if changes is None else bool(changes),
         "command": command,

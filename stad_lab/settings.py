@@ -89,7 +89,7 @@ class Settings:
     max_frames: int = 1000
     """Frames of a training episode, at most; CarRacing's own limit is 1,000."""
     cars: int = 16
-    """Cars that one process drives in step, with one batch through V and M."""
+    """Cars that one process drives in step, at most, with one batch through V and M. Fewer keep more cores busy."""
     validate_every: int = 5
     """Generations between two looks at the CMA mean on the validation tracks."""
     validation_tracks: int = 16
@@ -203,8 +203,8 @@ PRESETS = {
     ),
     # A car that drives, in about half an hour on two cores.
     "laptop": Settings(),
-    # The budget that the paper states, with World Models' sizes and loss, and about its passes over the data: one and a
-    # half for V, twenty for M. What the paper leaves open is our reading: one episode for each agent, for example.
+    # The budget that the paper states, with World Models' sizes and loss, and its passes over the data: one for V,
+    # twenty for M. What the paper leaves open is our reading: one episode for each agent, for example.
     "paper": Settings(
         name="paper",
         episodes=1000,
@@ -213,7 +213,7 @@ PRESETS = {
         width=32,
         kl_weight=1.0,
         free_bits=0.5,
-        v_steps=15000,
+        v_steps=10000,
         v_batch=100,
         m_steps=800,
         m_batch=50,
@@ -224,7 +224,6 @@ PRESETS = {
         tracks=1,
         initial_gas=0.0,
         patience=0,
-        cars=4,
         validate_every=20,
     ),
 }

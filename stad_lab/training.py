@@ -17,6 +17,11 @@ from stad_lab.parallel import keep_freed_memory
 RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
 
+def training_device() -> torch.device:
+    """Where V and M are trained: on a CUDA GPU if there is one. Agents always drive on the CPU, in many processes."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
 def fit(
     model: torch.nn.Module,
     batch_losses: Callable[[int], dict[str, torch.Tensor]],

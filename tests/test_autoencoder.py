@@ -45,6 +45,18 @@ def test_the_decoder_s_first_layer_is_a_transposed_convolution():
     assert torch.allclose(ours.bias.grad, general.bias.grad, atol=1e-6)
 
 
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_pictures_weights_and_losses_stay_on_one_device(variant):
+    # "meta" is a device without numbers: it refuses a mixture of devices as a GPU does, and needs none.
+    autoencoder = make_autoencoder(variant).to("meta", memory_format=torch.channels_last)
+    frames = np.zeros((3, 64, 64, 3), np.uint8)
+    frame, difference = to_pictures(frames, frames, "meta")
+    losses = autoencoder_losses(autoencoder, frame, difference, torch.zeros(3, 32, device="meta"), Settings())
+    losses["total"].backward()
+    assert {loss.device.type for loss in losses.values()} == {"meta"}
+    assert {parameter.grad.device.type for parameter in autoencoder.parameters()} == {"meta"}
+
+
 @pytest.mark.parametrize(
     ("variant", "seen", "redrawn"), [("frame", 3, 3), ("input", 6, 3), ("output", 3, 6), ("input_output", 6, 6)]
 )

@@ -76,6 +76,15 @@ def test_mixture_weights_sum_to_one_and_deviations_stay_in_bounds():
     assert mixture.logsigma.max() == 3
 
 
+def test_predictions_and_losses_stay_on_one_device():
+    mdn_rnn = make_mdn_rnn().to("meta")
+    latents, actions = (part.to("meta") for part in make_sequence())
+    mixture, state = mdn_rnn(latents, actions)
+    mdn_loss(mixture, latents).backward()
+    _, state = mdn_rnn.remember(latents[:, :1], actions[:, :1], state)
+    assert {part.device.type for part in (*mixture, *state, *(p.grad for p in mdn_rnn.parameters()))} == {"meta"}
+
+
 def test_a_sequence_equals_repeated_single_steps():
     mdn_rnn = make_mdn_rnn()
     latents, actions = make_sequence()
