@@ -84,7 +84,8 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
 
     Args:
         fast: True for the fast picture (`FastCarRacing`), False for Gymnasium's own CarRacing-v3 as it is.
-        **kwargs: passed to `gymnasium.make`, for example `render_mode="rgb_array"`.
+        **kwargs: passed to `gymnasium.make`, for example `render_mode="rgb_array"`, or, for the fast picture only,
+            `bar=False` to leave out the indicator bar.
 
     Returns:
         An environment with observations uint8 (96, 96, 3) and actions float32 (3,): steering in [-1, 1], gas and brake
@@ -103,8 +104,9 @@ class FastCarRacing(reference.CarRacing):
         **kwargs: as for Gymnasium's CarRacing.
     """
 
-    def __init__(self, bar: bool = True, **kwargs):
-        super().__init__(**kwargs)
+    def __init__(self, *args, bar: bool = True, **kwargs):
+        super().__init__(*args, **kwargs)
+        gym.utils.EzPickle.__init__(self, *args, bar=bar, **kwargs)  # what a copy is made with
         self._bar = bar
         self.ground = Ground()
 
@@ -120,8 +122,9 @@ class FastCarRacing(reference.CarRacing):
         return super().step(action)
 
     def close(self):
-        """As Gymnasium's close, and lets go of the texture (16 MB), which reference cycles would keep for long."""
+        """As Gymnasium's close, and lets go of the texture and the track, which would be kept for long, or for good."""
         super().close()
+        self._destroy()
         self.ground = Ground()
 
     def _render(self, mode: str):
@@ -233,7 +236,7 @@ def draw_car(view: np.ndarray, car: car_dynamics.Car, zoom: float) -> None:
     overlay = np.empty((2, 2 * QUARTER_ROWS, 2 * QUARTER_COLUMNS, 3), np.float32)
     for place, wheel in enumerate(car.wheels):
         turn = round((wheel.angle - angle) * TURN_STEPS)
-        phase = int(wheel.phase * PHASE_STEPS / math.tau) % PHASE_STEPS
+        phase = math.floor(wheel.phase * PHASE_STEPS / math.tau) % PHASE_STEPS
         overlay[QUARTERS[place]] = quarter_picture(place, turn, phase, zoom)
     area = view[CAR_AREA]
     area[:] = area * overlay[0] + overlay[1]

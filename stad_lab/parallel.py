@@ -13,11 +13,12 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
+from pathlib import Path
 
 import cv2
 import torch
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # from glibc's malloc.h
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # from glibc's malloc.h
 
 
 @contextmanager
@@ -47,24 +48,32 @@ def worker_processes(count: int) -> Iterator[ProcessPoolExecutor]:
 def keep_freed_memory() -> None:
     """Tell the C library to keep the memory that this process frees, instead of giving it back to the system.
 
-    A batch's arrays have the sizes of the batch before. Without this, Linux hands out and clears the same pages again
-    in every step, which costs a fifth of V's training time. Elsewhere than on Linux with glibc nothing happens.
+    A batch's arrays have the sizes of the batch before. Without this, Linux takes the same pages back, clears them and
+    hands them out again in every step. It holds until the process ends; elsewhere than on Linux with glibc nothing
+    happens.
     """
     if sys.platform == "linux" and platform.libc_ver()[0] == "glibc":
         library = ctypes.CDLL(None)
-        library.mallopt(M_MMAP_THRESHOLD, 2**30)
+        library.mallopt(M_MMAP_MAX, 0)
         library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
 
 
 def peak_memory() -> dict[str, float] | None:
-    """The most memory, in MB, that this process and the largest of its ended workers have held; None on Windows."""
+    """The most memory, in MB, that this process and the largest of its ended workers have held; None on Windows.
+
+    The worker's figure is an upper bound: on Linux a process begins with that of the process that started it.
+    """
     if sys.platform == "win32":
         return None
     import resource  # is not there on Windows
 
-    unit = 1e6 if sys.platform == "darwin" else 1e3  # bytes there, kilobytes on Linux
-    who = {"process": resource.RUSAGE_SELF, "worker": resource.RUSAGE_CHILDREN}
-    return {name: round(resource.getrusage(kind).ru_maxrss / unit, 1) for name, kind in who.items()}
+    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes on Linux
+    most = {"process": resource.RUSAGE_SELF, "worker": resource.RUSAGE_CHILDREN}
+    most = {name: resource.getrusage(who).ru_maxrss * unit / 1e6 for name, who in most.items()}
+    if sys.platform == "linux":
+        status = Path("/proc/self/status").read_text()
+        most["process"] = int(status.split("VmHWM:")[1].split()[0]) * unit / 1e6
+    return {name: round(value, 1) for name, value in most.items()}
 
 
 def start_worker() -> None:

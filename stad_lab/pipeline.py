@@ -5,8 +5,8 @@ autoencoder.safetensors       V
 mdn_rnn.safetensors           M
 evolution.json                every generation of CMA-ES
 controller.safetensors        C: the CMA mean that drove the validation tracks best
-record.json                   variant, settings, versions, commit, and the time (in seconds), the most memory that a
-                              process has held so far (in MB) and the budget of every stage
+record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
+                              stage, and the most memory that a process has held by its end (in MB, for each start)
 """
 
 import importlib.metadata
@@ -75,7 +75,7 @@ def train(
         finally:
             if did:
                 record["seconds"][stage] = record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
-                record.setdefault("peak_memory", {})[stage] = peak_memory()
+                record.setdefault("peak_memory", {}).setdefault(stage, []).append(peak_memory())
                 save_json(folder / "record.json", record)
         print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
         worked |= did

@@ -1,5 +1,6 @@
 """The fast environment is Gymnasium's CarRacing-v3: the same numbers to the last bit, the same picture to the eye."""
 
+import copy
 import math
 
 import numpy as np
@@ -207,6 +208,22 @@ def test_an_observation_belongs_to_whoever_got_it():
         observation = env.step(STRAIGHT)[0]
         assert np.array_equal(observation, other.step(STRAIGHT)[0])
         observation[:] = 0  # must not reach the pictures that the environment keeps
+
+
+def test_a_closed_environment_holds_no_track_and_can_be_reset_again():
+    env = make_env()
+    first = env.reset(seed=30)[0]
+    env.close()
+    env.close()
+    assert env.unwrapped.road == [] and env.unwrapped.ground.levels == []
+    assert env.unwrapped.world.bodies == []
+    assert np.array_equal(env.reset(seed=30)[0], first)
+
+
+def test_a_copy_is_made_with_the_same_arguments():
+    twin = copy.deepcopy(make_env(bar=False, domain_randomize=True).unwrapped)
+    assert twin.domain_randomize
+    assert not twin.reset(seed=0)[0][BAR_TOP:].any()
 
 
 def test_two_environments_do_not_paint_over_each_other():

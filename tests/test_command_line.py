@@ -73,7 +73,7 @@ def test_a_run_leaves_weights_log_and_record(quick_training):
     assert record["seconds"].keys() == {"rollouts", "autoencoder", "mdn_rnn", "controller"}
     assert record["peak_memory"].keys() == record["seconds"].keys()
     if sys.platform != "win32":
-        assert all(50 < peak < 3000 for stage in record["peak_memory"].values() for peak in stage.values())
+        assert all(50 < peak < 3000 for (stage,) in record["peak_memory"].values() for peak in stage.values())
     assert record["made_with"]["torch"] == importlib.metadata.version("torch")
     assert record["budget"]["random"] == {"episodes": 8, "frames": 8 * 60}
     assert record["budget"]["agents"] == record["budget"]["evolution"]["episodes"] == 4 * 4
