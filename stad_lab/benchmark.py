@@ -7,17 +7,20 @@
 
 A speed says more about a machine than about a program, so every part has a contender that does the same work in the
 usual way. The contenders take turns, in alternating order, and the median of the rounds counts. It takes about eight
-minutes, and they should be quiet ones: whatever else runs is measured too.
+minutes, and they should be quiet ones: whatever else runs is measured too. Everything runs on the CPU.
 """
 
 import dataclasses
 import functools
+import importlib.metadata
 import importlib.util
 import multiprocessing
+import platform
+import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from pathlib import Path
 
@@ -32,26 +35,27 @@ from stad_lab.agent import PRETRAINED, Agent, drive, load_agent, load_world_mode
 from stad_lab.autoencoder import AutoEncoder, autoencoder_losses, save_autoencoder, to_pictures
 from stad_lab.car_racing import BAR_TOP, HULL_COLUMN, HULL_ROW, MAX_FRAMES, make_env, place_car
 from stad_lab.controller import control
-from stad_lab.evolution import drive_parallel
+from stad_lab.evolution import drive_group, drive_parallel
 from stad_lab.frames import FrameMemory, to_frame
 from stad_lab.mdn_rnn import MDNRNN, mdn_loss
 from stad_lab.parallel import keep_freed_memory, worker_processes
 from stad_lab.pipeline import provenance
 from stad_lab.rollouts import RandomDriver, Rollouts, collect_rollouts, track_seeds
 from stad_lab.settings import Settings
+from stad_lab.training import read_ahead
 
-V_STEPS, M_STEPS, WARM_UP = 40, 10, 4  # training steps of a round, and how many of them are not timed
+V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, and how many of them are not timed
 VARIANT = "input"  # of the shipped agent that drives
-GYMNASIUM, FAST, PHYSICS, ENVPOOL = "Gymnasium", "stad_lab", "physics alone, no picture", "EnvPool"
+GYMNASIUM, FAST, PHYSICS = "Gymnasium", "stad_lab", "physics alone, no picture"
 CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))
 
 
-def benchmark(parts: Iterable[str], rounds: int = 5) -> dict:
+def benchmark(parts: list[str], rounds: int = 5) -> dict:
     """Run some parts of the benchmark and print their tables.
 
     Args:
         parts: of "parity", "renderer", "loop", "training".
-        rounds: how often the contenders take turns.
+        rounds: how often the contenders take turns; parity has no contenders and is measured once.
 
     Returns:
         A dict for JSON: what it was made with, and for each part its tables with every single measurement.
@@ -64,8 +68,8 @@ def benchmark(parts: Iterable[str], rounds: int = 5) -> dict:
         raise ValueError(
             f"parts={unknown or list(parts)}, rounds={rounds}: choose from {', '.join(PARTS)}, with 1 round or more"
         )
-    result = {"made_with": provenance("python -m stad_lab benchmark"), "rounds": rounds}
-    result["made_with"]["instructions"] = torch.backends.cpu.get_cpu_capability()
+    command = " ".join(["python -m stad_lab benchmark", *(f"--part {part}" for part in parts), f"--rounds {rounds}"])
+    result = {"made_with": provenance(command) | {"trained_on": "cpu", "processor": processor()}, "rounds": rounds}
     for part in parts:
         result[part] = PARTS[part](rounds)
         print(f"\n{part}")
@@ -74,11 +78,23 @@ def benchmark(parts: Iterable[str], rounds: int = 5) -> dict:
     return result
 
 
+def processor() -> str:
+    """The processor's name, as far as the system tells it, and the instructions that PyTorch uses of it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*: (.*)", cpuinfo.read_text()) if cpuinfo.exists() else []
+    return f"{names[0] if names else platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
+
+
 def take_turns(contenders: dict[str, Callable[[int], float]], rounds: int, label: str) -> dict:
-    """Let contenders take turns: a table of their speeds, in every round and the median, and ratios to the first one.
+    """Let contenders take turns: a table of their median speeds, and of the ratios to the first one's.
 
     Args:
         contenders: name -> function of the round's number that returns a speed.
+        rounds: number of rounds.
+        label: of the progress bar.
+
+    Returns:
+        name -> {"median", "ratio", "rounds": the speed in every round}.
     """
     speeds = {name: [] for name in contenders}
     for number in tqdm(range(rounds), label, unit="round"):
@@ -148,7 +164,10 @@ def compare_pictures(number: int, frames: int = MAX_FRAMES) -> tuple[np.ndarray,
 
 
 def measure_renderer(rounds: int) -> dict:
-    """Frames a second on one core, whole random episodes, resets included."""
+    """Frames a second on one core, whole random episodes, resets included.
+
+    EnvPool has its own tracks and its own picture, which it shrinks in a simpler way: it does about the same work.
+    """
     cv2.setNumThreads(1)
     physics = make_env()
     nothing = np.zeros((96, 96, 3), np.uint8)
@@ -159,7 +178,8 @@ def measure_renderer(rounds: int) -> dict:
         import envpool  # optional: pip install envpool
 
         pool = envpool.make_gymnasium("CarRacing-v3", num_envs=1, num_threads=1, seed=0)
-        contenders[ENVPOOL] = lambda number: pool_episode(pool, number)
+        pool.reset()
+        contenders[f"EnvPool {importlib.metadata.version('envpool')}"] = lambda number: pool_episode(pool, number)
     else:
         print("EnvPool is not installed and takes no part; to have it in: pip install envpool")
     for contender in contenders.values():  # a warm-up: caches fill, memory is taken
@@ -199,7 +219,11 @@ def pool_episode(pool, number: int) -> float:
 
 
 def measure_loop(rounds: int) -> dict:
-    """A generation of 8 agents at `paper` settings against Gymnasium alone, the cost of more cars, and of one frame."""
+    """A generation of 8 agents at `paper` settings against Gymnasium alone, the cost of more cars, and of one frame.
+
+    Gymnasium's two processes drive at random and never wait for each other; the agents drive on the road, and their
+    generation ends when its last car has.
+    """
     settings = Settings.preset("paper")
     folder, agent = PRETRAINED / VARIANT, load_agent(VARIANT)
     rng = np.random.default_rng(0)
@@ -220,11 +244,9 @@ def measure_loop(rounds: int) -> dict:
         for contender in contenders.values():
             contender(rounds)
         tables = {"frames a second, a generation": take_turns(contenders, rounds, "loop")}
-        short = dataclasses.replace(settings, max_frames=250, cars=32)
+        short = dataclasses.replace(settings, max_frames=250)
         crowds = {
-            f"{cars} in step": lambda number, cars=cars: parallel_speed(
-                one, folder, np.repeat(agent.parameters[None], cars, axis=0), list(range(cars)), short
-            )
+            f"{cars} in step": lambda number, cars=cars: crowd_speed(one, agent.parameters, cars, short)
             for cars in (1, 2, 4, 8, 16, 32)
         }
         tables["frames a second, cars in one process"] = take_turns(crowds, rounds, "cars")
@@ -237,7 +259,8 @@ def measure_loop(rounds: int) -> dict:
 
 
 def make_world_models_sizes(folder: Path) -> None:
-    """A V of World Models' width, untrained, beside the shipped M: its speed is that of a trained one."""
+    """A V of World Models' width, untrained, beside the shipped M: it has as much to compute as a trained one."""
+    torch.manual_seed(0)
     settings = Settings.preset("paper")
     autoencoder = AutoEncoder(VARIANT, settings.latent_size, settings.width)
     save_autoencoder(folder / "autoencoder.safetensors", autoencoder, settings, [])
@@ -250,6 +273,13 @@ def parallel_speed(
     """Frames a second of all agents together, each on its track."""
     begin = time.perf_counter()
     _, lengths = drive_parallel(executor, folder, VARIANT, agents, tracks, settings)
+    return lengths.sum() / (time.perf_counter() - begin)
+
+
+def crowd_speed(executor: Executor, parameters: np.ndarray, cars: int, settings: Settings) -> float:
+    """Frames a second of one process in which so many cars drive in step."""
+    agents, tracks, begin = np.repeat(parameters[None], cars, axis=0), list(range(cars)), time.perf_counter()
+    _, lengths = executor.submit(drive_group, PRETRAINED / VARIANT, VARIANT, agents, tracks, True, settings).result()
     return lengths.sum() / (time.perf_counter() - begin)
 
 
@@ -295,8 +325,8 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     memory, observations = FrameMemory(stride), [observation] * cars
 
     def prepare():
-        frames = np.stack([to_frame(observation) for observation in observations])
-        return to_pictures(frames, memory.push(frames))
+        seen = np.stack([to_frame(observation) for observation in observations])
+        return to_pictures(seen, memory.push(seen))
 
     with torch.inference_mode():
         seconds["preparation"] = seconds_of(prepare, frames // 4) / cars
@@ -367,8 +397,8 @@ class Pictures(Dataset):
 def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STEPS) -> tuple[float, float]:
     """Train V for a few steps: (images a second, held-out loss after them).
 
-    Plain is what a tutorial would write: a Dataset of single pictures, a DataLoader, PyTorch's layers and memory order.
-    Ours is what `autoencoder.train_autoencoder` does. Weights, batches and noise are the same.
+    Plain is what a tutorial would write: a Dataset of single pictures, a DataLoader, PyTorch's layers, memory order and
+    Adam as they come. Ours does as `train_autoencoder` and `training.fit` do. Weights, batches and noise are the same.
     """
     settings = Settings.preset("laptop", width=width)
     rollouts = Rollouts(folder)
@@ -379,15 +409,18 @@ def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STE
     batches = [np.sort(rng.choice(training, settings.v_batch)) for _ in range(steps)]
     noise = torch.from_numpy(rng.standard_normal((steps, settings.v_batch, settings.latent_size), np.float32))
     if plain:
-        layer = autoencoder.decoder[2]
-        autoencoder.decoder[2] = nn.ConvTranspose2d(layer.in_channels, layer.out_channels, layer.kernel_size)
-        autoencoder.decoder[2].load_state_dict(layer.state_dict())
+        for place, stride in ((2, 1), (-1, 2)):
+            ours = autoencoder.decoder[place]
+            layer = nn.ConvTranspose2d(ours.in_channels, ours.out_channels, ours.kernel_size, stride)
+            layer.load_state_dict(ours.state_dict())
+            autoencoder.decoder[place] = layer
         pictures = DataLoader(Pictures(rollouts, settings.stride), batch_sampler=batches)
     else:
         keep_freed_memory()
         autoencoder.to(memory_format=torch.channels_last)
-        pictures = (to_pictures(*rollouts.pairs(batch, settings.stride)) for batch in batches)
-    optimizer = torch.optim.Adam(autoencoder.parameters(), lr=settings.v_learning_rate)
+        pairs = read_ahead(lambda step: rollouts.pairs(batches[step], settings.stride), range(steps))
+        pictures = (to_pictures(*pair) for _, pair in pairs)
+    optimizer = torch.optim.Adam(autoencoder.parameters(), lr=settings.v_learning_rate, fused=not plain)
     for step, (frame, difference) in enumerate(pictures):
         if step == WARM_UP:
             begin = time.perf_counter()
@@ -403,7 +436,7 @@ def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STE
 
 
 def train_m(plain: bool, seed: int, steps: int = M_STEPS, batch: int | None = None) -> float:
-    """Frames a second of M in training; ours differs only in keeping freed memory. The data are noise: speed is all."""
+    """Frames a second of M in training; ours keeps freed memory and has the fused Adam. Its data are noise."""
     if not plain:
         keep_freed_memory()
     settings = Settings.preset("paper")
@@ -412,7 +445,7 @@ def train_m(plain: bool, seed: int, steps: int = M_STEPS, batch: int | None = No
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
     latents = torch.randn(batch, settings.m_sequence + 1, settings.latent_size)
     actions = torch.randn(batch, settings.m_sequence, 3)
-    optimizer = torch.optim.Adam(mdn_rnn.parameters(), lr=settings.m_learning_rate)
+    optimizer = torch.optim.Adam(mdn_rnn.parameters(), lr=settings.m_learning_rate, fused=not plain)
     for step in range(steps):
         if step == WARM_UP:
             begin = time.perf_counter()

@@ -1,8 +1,8 @@
 """The environment: Gymnasium's CarRacing-v3, and the same environment with a fast picture.
 
-Gymnasium draws some 500 polygons into 1000 x 800 pixels for every observation and shrinks the result to 96 x 96; that
-is 98% of its time. But the ground hardly changes within an episode. So `FastCarRacing` paints it once into one large
-texture, and each frame needs only three things:
+For every observation Gymnasium turns some 800 polygons, draws those in sight on 1000 x 800 pixels and shrinks the
+result to 96 x 96; that is 98% of its time. But the ground hardly changes within an episode. So `FastCarRacing` paints
+it once into one large texture, and each frame needs only three things:
 
 1. one affine warp of the texture to what the camera sees (`Ground.look`),
 2. the car on top, blended from four small pictures with a wheel each (`draw_car`),

@@ -158,8 +158,8 @@ def drive_parallel(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode for each row of `parameters` (episodes, parameters): (returns, lengths in frames).
 
-    They drive in two groups or more, of at most `settings.cars`, under its max_frames and patience. The groups do not
-    depend on how many processes share them, so neither do the numbers.
+    They drive in groups of at most `settings.cars`, under its max_frames and patience, and in two at least, so that two
+    cores have work. The groups do not depend on how many processes share them, so neither do the numbers.
     """
     size = min(settings.cars, math.ceil(len(tracks) / 2))
     groups = [slice(start, start + size) for start in range(0, len(tracks), size)]

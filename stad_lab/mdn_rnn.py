@@ -38,7 +38,7 @@ class Mixture(NamedTuple):
 class MDNRNN(nn.Module):
     """M: latents and actions -> the distribution of the next latents.
 
-    A step is a sequence of length one.
+    One step and a whole sequence run the same code: a step is a sequence of length one.
 
     Args:
         latent_size: dimensions of z.
@@ -70,12 +70,7 @@ class MDNRNN(nn.Module):
 
     def remember(self, latents: torch.Tensor, actions: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
         """The memory without the prediction: h after every step (batch, time, hidden_size), and the state."""
-        inputs = torch.cat([latents, actions], dim=2)
-        if inputs.shape[1] > 1 or state is None:
-            return self.lstm(inputs, state)
-        # A single step, as in driving: nn.LSTM's preparations for a sequence take longer than the step itself.
-        hidden, cell = torch.lstm_cell(inputs[:, 0], (state[0][0], state[1][0]), *self.lstm.all_weights[0])
-        return hidden[:, None], (hidden[None], cell[None])
+        return self.lstm(torch.cat([latents, actions], dim=2), state)
 
     def mixture(self, hidden: torch.Tensor) -> Mixture:
         """The head: h (batch, time, hidden_size) -> the mixture it stands for."""
@@ -177,25 +172,24 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
     first_heldout = rollouts.episode[rollouts.split()[1][0]]
 
-    def losses_on(episodes: slice, batch: int, rng: np.random.Generator) -> dict[str, torch.Tensor]:
-        latents, actions = sequence_batch(
-            encoded[episodes], rollouts.actions[episodes], settings.m_sequence, batch, rng
-        )
+    def draw(episodes: slice, batch: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+        return sequence_batch(encoded[episodes], rollouts.actions[episodes], settings.m_sequence, batch, rng)
+
+    def batch(step: int) -> tuple[torch.Tensor, torch.Tensor]:
+        return draw(slice(first_heldout), settings.m_batch, np.random.default_rng([settings.seed, 2, step]))
+
+    def losses(latents: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         latents = latents.to(device)
         mixture, _ = mdn_rnn(latents[:, :-1], actions.to(device))
         return {"total": mdn_loss(mixture, latents[:, 1:])}
 
-    def batch_losses(step: int) -> dict[str, torch.Tensor]:
-        rng = np.random.default_rng([settings.seed, 2, step])
-        return losses_on(slice(first_heldout), settings.m_batch, rng)
-
     @torch.no_grad()
     def heldout_losses() -> dict[str, float]:
-        return {"total": losses_on(slice(first_heldout, None), 64, np.random.default_rng(0))["total"].item()}
+        return {"total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))["total"].item()}
 
     checkpoint = path.with_name("mdn_rnn.training.safetensors")
     history = fit(
-        mdn_rnn, batch_losses, heldout_losses, settings.m_steps, settings.m_learning_rate, checkpoint, "train M"
+        mdn_rnn, batch, losses, heldout_losses, settings.m_steps, settings.m_learning_rate, checkpoint, "train M"
     )
     save_mdn_rnn(path, mdn_rnn, variant, history)
     checkpoint.unlink()

@@ -172,14 +172,12 @@ class EpisodeFrames(Sequence):
     def __getitem__(self, index: int) -> np.ndarray:
         return np.load(self.paths[index], allow_pickle=False)
 
-    def read(self, index: int, moments: list[int]) -> list[bytes]:
-        """Single frames of episode `index`, as the bytes of uint8 (64, 64, 3)."""
+    def read(self, index: int, moments: list[int], into: list[np.ndarray]) -> None:
+        """Read single frames of episode `index` into arrays uint8 (64, 64, 3)."""
         with self.paths[index].open("rb", buffering=0) as file:
-            frames = []
-            for moment in moments:
-                file.seek(NPY_HEADER + moment * FRAME_SIZE**2 * 3)
-                frames.append(file.read(FRAME_SIZE**2 * 3))
-            return frames
+            for moment, frame in zip(moments, into, strict=True):
+                file.seek(NPY_HEADER + moment * frame.nbytes)
+                file.readinto(frame.data)
 
 
 class Rollouts:
@@ -230,10 +228,10 @@ class Rollouts:
     def pairs(self, indices: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
         """Frames and the frames to subtract from them, for indices into the whole dataset: two uint8 (n, 64, 64, 3)."""
         episodes, moments = self.episode[indices], self.moment[indices]
-        wanted = zip(episodes, moments, earlier_index(moments, stride), strict=True)
-        both = zip(*(self.frames.read(episode, moments) for episode, *moments in wanted), strict=True)
-        shape = (len(indices), FRAME_SIZE, FRAME_SIZE, 3)
-        frames, earlier = (np.frombuffer(bytearray().join(part), np.uint8).reshape(shape) for part in both)
+        before = earlier_index(moments, stride)
+        frames, earlier = np.empty((2, len(indices), FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        for place, episode in enumerate(episodes):
+            self.frames.read(episode, [moments[place], before[place]], [frames[place], earlier[place]])
         return frames, earlier
 
     def split(self, heldout: float = 0.05) -> tuple[np.ndarray, np.ndarray]:

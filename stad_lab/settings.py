@@ -89,7 +89,7 @@ class Settings:
     max_frames: int = 1000
     """Frames of a training episode, at most; CarRacing's own limit is 1,000."""
     cars: int = 16
-    """Cars that one process drives in step, at most, with one batch through V and M. Fewer keep more cores busy."""
+    """Cars that one process drives in step, at most, with one batch through V and M. Fewer keep more processes busy."""
     validate_every: int = 5
     """Generations between two looks at the CMA mean on the validation tracks."""
     validation_tracks: int = 16

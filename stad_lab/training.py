@@ -1,11 +1,13 @@
 """One training loop for V and for M: Adam, a falling learning rate, a history, and a resume that changes nothing.
 
 What happens in step s depends on (seed, s) and the weights alone: the caller draws step s's batch and noise from a
-Generator seeded with both. So a run that was interrupted and resumed makes the same updates as one that was not.
+Generator seeded with both. So a run that was interrupted and resumed makes the same updates as one that was not: bit
+for bit on the CPU, and nearly so on a GPU, whose convolutions add up in any order.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import torch
@@ -18,13 +20,17 @@ RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
 
 def training_device() -> torch.device:
-    """Where V and M are trained: on a CUDA GPU if there is one. Agents always drive on the CPU, in many processes."""
+    """Where V and M are trained: on a CUDA GPU if there is one, unless CUDA_VISIBLE_DEVICES is set to nothing.
+
+    Agents always drive on the CPU, in many processes.
+    """
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def fit(
     model: torch.nn.Module,
-    batch_losses: Callable[[int], dict[str, torch.Tensor]],
+    batch: Callable[[int], tuple],
+    losses: Callable[..., dict[str, torch.Tensor]],
     heldout_losses: Callable[[], dict[str, float]],
     steps: int,
     learning_rate: float,
@@ -34,7 +40,8 @@ def fit(
     """Train `model` in place for `steps` steps, or for those left after the checkpoint.
 
     Args:
-        batch_losses: step -> named losses of that step's batch; "total" is minimised.
+        batch: step -> that step's batch, as `read_ahead` wants it.
+        losses: the batch -> its named losses; "total" is minimised.
         heldout_losses: named losses on held-out data, computed without gradients.
         learning_rate: Adam's rate at the start; it falls to a tenth of it along a cosine.
         checkpoint: file of the training state, read if it exists, written with every entry of the history.
@@ -48,26 +55,26 @@ def fit(
         FloatingPointError: the loss is not finite.
     """
     keep_freed_memory()
-    optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate)
+    optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate, fused=True)  # one pass over the weights, not ten
     history = load_state(checkpoint, model, optimizer) if checkpoint.exists() else []
     start, sums = history[-1]["step"] if history else 0, {}
     every = max(1, steps // RECORDS)
     step = start
     try:
-        progress = tqdm(range(start, steps), label, steps, initial=start, unit="step")
-        for step in progress:
+        progress = tqdm(read_ahead(batch, range(start, steps)), label, steps, initial=start, unit="step")
+        for step, present in progress:
             for group in optimizer.param_groups:
                 group["lr"] = learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps))
-            losses = batch_losses(step)
-            if not torch.isfinite(losses["total"]):
+            found = losses(*present)
+            if not torch.isfinite(found["total"]):
                 raise FloatingPointError(
-                    f"{label}: the loss is {losses['total'].item()} in step {step}: lower the learning rate"
+                    f"{label}: the loss is {found['total'].item()} in step {step}: lower the learning rate"
                 )
             optimizer.zero_grad(set_to_none=True)
-            losses["total"].backward()
+            found["total"].backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 100.0)
             optimizer.step()
-            for name, loss in losses.items():
+            for name, loss in found.items():
                 sums[name] = sums.get(name, 0.0) + loss.item()
             if (step + 1) % every == 0 or step + 1 == steps:
                 count = step + 1 - (history[-1]["step"] if history else 0)
@@ -83,6 +90,15 @@ def fit(
     return history
 
 
+def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[int, tuple]]:
+    """Every step with its batch, which a thread has read while the step before was trained."""
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(batch, steps.start)
+        for step in steps:
+            present, following = following, reader.submit(batch, step + 1) if step + 1 < steps.stop else None
+            yield step, present.result()
+
+
 def save_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, history: list) -> None:
     """Write everything the next step depends on: weights, Adam's moments, and the history, which says where we are."""
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
@@ -96,10 +112,12 @@ def load_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimi
     tensors, facts = load_tensors(path, "run the same command again, from the start")
     weights = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith("model.")}
     load_into(model, weights, path)
-    state = optimizer.state_dict()
+    state, parameters = optimizer.state_dict(), list(model.parameters())
     for name, tensor in tensors.items():
         if name.startswith("adam."):
-            _, number, moment = name.split(".")
-            state["state"].setdefault(int(number), {})[moment] = tensor
+            number, moment = int(name.split(".")[1]), name.split(".")[2]
+            if tensor.shape == parameters[number].shape:  # a moment, and it must lie in memory as its weights do
+                tensor = torch.empty_like(parameters[number]).copy_(tensor)
+            state["state"].setdefault(number, {})[moment] = tensor
     optimizer.load_state_dict(state)
     return facts["history"]

@@ -8,6 +8,7 @@ from stad_lab.autoencoder import (
     VARIANTS,
     AutoEncoder,
     FromOnePixel,
+    ToColours,
     autoencoder_losses,
     load_autoencoder,
     save_autoencoder,
@@ -32,17 +33,25 @@ def make_batch(count=3, seed=0):
     return *to_pictures(frames, earlier), torch.from_numpy(rng.standard_normal((count, 32), np.float32))
 
 
-def test_the_decoder_s_first_layer_is_a_transposed_convolution():
+@pytest.mark.parametrize(
+    ("ours", "general", "size", "drawn"),
+    [
+        (FromOnePixel(8, 6, 5), torch.nn.ConvTranspose2d(8, 6, 5), 1, 5),
+        (ToColours(8, 3), torch.nn.ConvTranspose2d(8, 3, 6, stride=2), 30, 64),
+    ],
+)
+def test_the_decoder_s_own_layers_are_transposed_convolutions(ours, general, size, drawn):
     torch.manual_seed(0)
-    ours, general = FromOnePixel(8, 6, 5), torch.nn.ConvTranspose2d(8, 6, 5)
     general.load_state_dict(ours.state_dict())
-    pixels, wanted = torch.randn(3, 8, 1, 1), torch.randn(3, 6, 5, 5)
+    pictures, wanted = torch.randn(3, 8, size, size), torch.randn(3, ours.out_channels, drawn, drawn)
+    results = []
     for layer in (ours, general):
-        (layer(pixels) * wanted).sum().backward()
-    assert ours(pixels).shape == (3, 6, 5, 5)
-    assert torch.allclose(ours(pixels), general(pixels), atol=1e-6)
-    assert torch.allclose(ours.weight.grad, general.weight.grad, atol=1e-6)
-    assert torch.allclose(ours.bias.grad, general.bias.grad, atol=1e-6)
+        seen = pictures.clone().requires_grad_()
+        (layer(seen) * wanted).sum().backward()
+        results.append([layer(pictures), seen.grad, layer.weight.grad, layer.bias.grad])
+    for one, other in zip(*results, strict=True):
+        assert one.shape == other.shape
+        assert torch.allclose(one, other, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

@@ -2,7 +2,6 @@
 
 import json
 
-import numpy as np
 import pytest
 
 from stad_lab.benchmark import FAST, GYMNASIUM, PHYSICS, benchmark, describe, frame_budget, take_turns, train_m, train_v
@@ -32,19 +31,19 @@ def test_the_parts_of_a_frame_add_up_to_the_whole():
     whole = budget.pop("together")
     assert sum(budget.values()) == pytest.approx(whole)
     assert {"physics", "picture", "preparation", "V", "M", "C"} < budget.keys()
-    assert all(value > 0 for name, value in budget.items() if name != "all else")
+    assert all(0 < budget[name] < whole for name in ("physics", "preparation", "V", "M", "C"))
 
 
 def test_the_plain_way_and_ours_train_the_same_v(tmp_path):
     collect_rollouts(Settings.preset("quick"), tmp_path)
-    (_, plain), (_, ours) = (train_v(way, 8, tmp_path, seed=0, steps=8) for way in (True, False))
-    (_, other) = train_v(False, 8, tmp_path, seed=1, steps=8)
-    assert ours == pytest.approx(plain, rel=1e-4)
-    assert ours != pytest.approx(other, rel=1e-4)
+    (_, plain), (_, ours) = (train_v(way, 8, tmp_path, seed=0, steps=6) for way in (True, False))
+    (_, other) = train_v(False, 8, tmp_path, seed=1, steps=6)
+    assert ours == pytest.approx(plain, rel=1e-3)
+    assert ours != pytest.approx(other, rel=1e-3)
 
 
 def test_m_s_speed_is_measured():
-    assert np.isfinite(train_m(True, seed=0, steps=6, batch=4))
+    assert 1 < train_m(True, seed=0, steps=6, batch=4) < 1e9
 
 
 def test_the_command_writes_every_measurement(tmp_path, command_line):
@@ -55,9 +54,9 @@ def test_the_command_writes_every_measurement(tmp_path, command_line):
     assert {GYMNASIUM, FAST, PHYSICS} <= table.keys()
     assert all(len(row["rounds"]) == 1 and row["median"] > 0 for row in table.values())
     assert table[FAST]["ratio"] > 1
-    assert result["made_with"]["command"] == "python -m stad_lab benchmark"
+    assert result["made_with"]["command"] == "python -m stad_lab benchmark --part renderer --rounds 1"
     assert f"{FAST}  " in process.stdout
-    assert ("EnvPool is not installed" in process.stdout) == ("EnvPool" not in table)
+    assert ("EnvPool is not installed" in process.stdout) != any(name.startswith("EnvPool") for name in table)
 
 
 @pytest.mark.parametrize(("parts", "rounds"), [(["speed"], 5), (["parity"], 0)])
