@@ -3,6 +3,7 @@
 import os
 
 os.environ.setdefault("STAD_LAB_SETTINGS", "quick")
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")  # a GPU does not repeat its sums bit for bit
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # check_env tries render_mode="human": no window may open
 
 import subprocess

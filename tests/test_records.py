@@ -49,8 +49,8 @@ def test_the_readme_s_speeds_are_the_benchmark_s():
     speeds = result["renderer"]["frames a second on one core"] | result["loop"]["frames a second, a generation"]
     assert any(name.startswith("EnvPool") for name in speeds)
     for name, value in speeds.items():
-        label = name.replace(", 2 processes", "").replace("Gymnasium", "Gymnasium 1.4.0", name == "Gymnasium")
-        if not name.endswith("1 process"):
+        label = {"Gymnasium": "Gymnasium 1.4.0"}.get(name, name.removesuffix(", 2 processes"))
+        if not label.endswith("1 process"):
             assert cells(label) == [f"{value['median']:,.0f}", f"{value['ratio']:.1f}"]
 
 
