@@ -21,7 +21,7 @@ from tqdm.auto import tqdm
 from stad_lab.agent import Agent, drive, load_controller, load_world_model, save_controller
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.controller import initial_parameters
-from stad_lab.parallel import worker_processes
+from stad_lab.parallel import return_freed_memory, worker_processes
 from stad_lab.rollouts import track_seeds
 from stad_lab.settings import Settings, check_same_run
 
@@ -179,6 +179,7 @@ def drive_group(
     autoencoder, mdn_rnn, stride, crop_bar = load_world_model(folder, variant)
     agent = Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
     rules = {"max_frames": limits.max_frames, "patience": limits.patience} if limits else {}
+    return_freed_memory()
     return drive(agent, tracks, fast, **rules)
 
 

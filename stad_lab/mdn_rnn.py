@@ -119,13 +119,15 @@ def check_temperature(temperature: float) -> None:
 @torch.no_grad()
 def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -> list[np.ndarray]:
     """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
-    encoded, device = [], next(autoencoder.parameters()).device
-    for frames in tqdm(rollouts.frames, "encode", unit="episode"):
+    device = next(autoencoder.parameters()).device
+    # One array, made before the work: a small one kept after each episode would chop up the memory that is freed.
+    encoded = np.empty((2, len(rollouts), autoencoder.latent_size), np.float32)
+    for episode, frames in enumerate(tqdm(rollouts.frames, "encode", unit="episode")):
         count = max(1, len(frames) // 250)
         pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
         parts = [torch.stack(autoencoder.encode(*to_pictures(*pair, device))) for pair in pairs]
-        encoded.append(torch.cat(parts, dim=1).cpu().numpy())
-    return encoded
+        encoded[:, rollouts.episode == episode] = torch.cat(parts, dim=1).cpu().numpy()
+    return np.split(encoded, np.flatnonzero(np.diff(rollouts.episode)) + 1, axis=1)
 
 
 def sequence_batch(

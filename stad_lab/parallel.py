@@ -4,6 +4,7 @@ Any `concurrent.futures.Executor` serves; this is the one a laptop has built in.
 """
 
 import ctypes
+import functools
 import multiprocessing
 import os
 import platform
@@ -52,10 +53,25 @@ def keep_freed_memory() -> None:
     hands them out again in every step. It holds until the process ends; elsewhere than on Linux with glibc nothing
     happens.
     """
-    if sys.platform == "linux" and platform.libc_ver()[0] == "glibc":
+    if has_glibc():
         library = ctypes.CDLL(None)
         library.mallopt(M_MMAP_MAX, 0)
         library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def return_freed_memory(above: float = 2e9) -> None:
+    """Give freed memory back to the system after all, if the process holds more than so many bytes.
+
+    Kept memory is chopped up in time: training M at paper scale would hold some 15 MB more after every step.
+    """
+    if has_glibc() and int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > above:
+        ctypes.CDLL(None).malloc_trim(0)
+
+
+@functools.cache
+def has_glibc() -> bool:
+    """Whether this is Linux with the GNU C library."""
+    return sys.platform == "linux" and platform.libc_ver()[0] == "glibc"
 
 
 def peak_memory() -> dict[str, float] | None:

@@ -14,7 +14,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
-from stad_lab.parallel import keep_freed_memory
+from stad_lab.parallel import keep_freed_memory, return_freed_memory
 
 RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
@@ -74,6 +74,7 @@ def fit(
             found["total"].backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 100.0)
             optimizer.step()
+            return_freed_memory()
             for name, loss in found.items():
                 sums[name] = sums.get(name, 0.0) + loss.item()
             if (step + 1) % every == 0 or step + 1 == steps:

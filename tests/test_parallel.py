@@ -1,0 +1,37 @@
+"""Memory: kept for the next step, but not without bound."""
+
+import subprocess
+import sys
+
+import pytest
+
+from stad_lab.parallel import has_glibc
+
+FREED = """
+import numpy as np
+from pathlib import Path
+from stad_lab.parallel import keep_freed_memory, return_freed_memory
+
+def held():
+    return int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0]) / 1e3
+
+keep_freed_memory()
+begin = held()
+large = [np.ones(4_000_000, np.uint8) for _ in range(100)]
+del large
+kept = held() - begin
+return_freed_memory(above=1e12)
+still = held() - begin
+return_freed_memory(above=100e6)
+print(kept, still, held() - begin)
+"""
+
+
+@pytest.mark.skipif(not has_glibc(), reason="only glibc is told to keep memory")
+def test_freed_memory_is_kept_and_returned_when_the_process_holds_too_much():
+    process = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, timeout=60)
+    assert process.returncode == 0, process.stderr
+    kept, still, returned = map(float, process.stdout.split())
+    assert kept > 350
+    assert still > 350
+    assert returned < 50
