@@ -76,3 +76,11 @@ def test_the_readme_reports_the_shipped_evaluation(variant):
     low, high = result["interval"]
     for figure in (f"{result['mean']:.1f}", f"{result['standard_deviation']:.1f}", f"{low:.1f} to {high:.1f}"):
         assert figure in row
+
+
+def test_the_shipped_agent_of_input_drives_as_well_with_either_renderer():
+    official, fast = read("input", "evaluation.json"), read("input", "evaluation_fast.json")
+    assert (official["renderer"], fast["renderer"]) == ("official", "fast")
+    assert official["controller_sha256"] == fast["controller_sha256"]
+    assert [episode["track"] for episode in official["episodes"]] == [episode["track"] for episode in fast["episodes"]]
+    assert abs(official["mean"] - fast["mean"]) < 15
