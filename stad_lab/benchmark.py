@@ -25,18 +25,19 @@ from concurrent.futures import Executor, ProcessPoolExecutor
 from pathlib import Path
 
 import cv2
+import gymnasium as gym
 import numpy as np
 import torch
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 from tqdm.auto import tqdm
 
-from stad_lab.agent import PRETRAINED, Agent, drive, load_agent, load_world_model
+from stad_lab.agent import PRETRAINED, Agent, drive, load_agent
 from stad_lab.autoencoder import AutoEncoder, autoencoder_losses, save_autoencoder, to_pictures
 from stad_lab.car_racing import BAR_TOP, HULL_COLUMN, HULL_ROW, MAX_FRAMES, make_env, place_car
 from stad_lab.controller import control
 from stad_lab.evolution import drive_group, drive_parallel
-from stad_lab.frames import FrameMemory, to_frame
+from stad_lab.frames import OBSERVATION_SHAPE, FrameMemory, to_frame
 from stad_lab.mdn_rnn import MDNRNN, mdn_loss
 from stad_lab.parallel import keep_freed_memory, worker_processes
 from stad_lab.pipeline import provenance
@@ -169,10 +170,7 @@ def measure_renderer(rounds: int) -> dict:
     EnvPool has its own tracks and its own picture, which it shrinks in a simpler way: it does about the same work.
     """
     cv2.setNumThreads(1)
-    physics = make_env()
-    nothing = np.zeros((96, 96, 3), np.uint8)
-    physics.unwrapped._render = lambda mode: nothing.copy()
-    envs = {GYMNASIUM: make_env(fast=False), FAST: make_env(), PHYSICS: physics}
+    envs = {GYMNASIUM: make_env(fast=False), FAST: make_env(), PHYSICS: make_blind_env()}
     contenders = {name: lambda number, env=env: random_episodes(env, number) for name, env in envs.items()}
     if importlib.util.find_spec("envpool"):
         import envpool  # optional: pip install envpool
@@ -185,6 +183,13 @@ def measure_renderer(rounds: int) -> dict:
     for contender in contenders.values():  # a warm-up: caches fill, memory is taken
         contender(rounds)
     return {"frames a second on one core": take_turns(contenders, rounds, "renderer")}
+
+
+def make_blind_env() -> gym.Env:
+    """The environment with its physics and rewards, but without a picture: a black one is handed out."""
+    env = make_env()
+    env.unwrapped._render = lambda mode: np.zeros(OBSERVATION_SHAPE, np.uint8)
+    return env
 
 
 def random_actions(number: int) -> np.ndarray:
@@ -299,19 +304,17 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
 
     Parts are timed one by one, on what the shipped agent sees; "all else" is what a real drive takes beyond their sum.
     """
-    folder = PRETRAINED / VARIANT
-    autoencoder, mdn_rnn, stride, _ = load_world_model(folder, VARIANT)
     agent = load_agent(VARIANT)
+    autoencoder, mdn_rnn = agent.autoencoder, agent.mdn_rnn
     parameters = np.repeat(agent.parameters[None], cars, axis=0)
-    crowd = Agent(autoencoder, mdn_rnn, parameters, stride)
+    crowd = Agent(autoencoder, mdn_rnn, parameters, agent.stride, agent.crop_bar)
     drive(crowd, list(range(cars)), max_frames=50)
     begin = time.perf_counter()
     _, lengths = drive(crowd, list(range(cars)), max_frames=frames)
     whole = (time.perf_counter() - begin) / lengths.sum()
 
-    env, blind = make_env(bar=False), make_env(bar=False)
+    env, blind = make_env(bar=False), make_blind_env()
     observation = env.reset(seed=0)[0]
-    blind.unwrapped._render = lambda mode: np.zeros_like(observation)
     actions = []
     for _ in range(frames):
         actions.append(agent.act(observation))
@@ -322,7 +325,7 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     with_picture, without = (iter(actions) for _ in range(2))
     seconds["physics"] = seconds_of(lambda: blind.step(next(without)), frames)
     seconds["picture"] = seconds_of(lambda: env.step(next(with_picture)), frames) - seconds["physics"]
-    memory, observations = FrameMemory(stride), [observation] * cars
+    memory, observations = FrameMemory(agent.stride), [observation] * cars
 
     def prepare():
         seen = np.stack([to_frame(observation) for observation in observations])

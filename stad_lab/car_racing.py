@@ -194,7 +194,8 @@ class Ground:
             angle: of the hull, radians; the camera turns with it.
             zoom: window pixels (of 1000 x 800) per world unit.
         """
-        step_x, step_y = reference.WINDOW_W / 96 / zoom, reference.WINDOW_H / 96 / zoom  # world units to a pixel
+        step_x = reference.WINDOW_W / OBSERVATION_SIZE / zoom  # world units from one pixel to the next
+        step_y = reference.WINDOW_H / OBSERVATION_SIZE / zoom
         level = min(len(LEVELS) - 1, int(math.log2(max(1, step_x * TEXTURE_SCALE / TEXELS))))
         texels = TEXTURE_SCALE / LEVELS[level]
         cos, sin = math.cos(angle) * texels, math.sin(angle) * texels

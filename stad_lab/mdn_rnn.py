@@ -121,13 +121,14 @@ def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -
     """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
     device = next(autoencoder.parameters()).device
     # One array, made before the work: a small one kept after each episode would chop up the memory that is freed.
-    encoded = np.empty((2, len(rollouts), autoencoder.latent_size), np.float32)
-    for episode, frames in enumerate(tqdm(rollouts.frames, "encode", unit="episode")):
+    whole = np.empty((2, len(rollouts), autoencoder.latent_size), np.float32)
+    encoded = np.split(whole, np.flatnonzero(np.diff(rollouts.episode)) + 1, axis=1)  # views on it
+    for episode, frames in zip(encoded, tqdm(rollouts.frames, "encode", unit="episode"), strict=True):
         count = max(1, len(frames) // 250)
         pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
         parts = [torch.stack(autoencoder.encode(*to_pictures(*pair, device))) for pair in pairs]
-        encoded[:, rollouts.episode == episode] = torch.cat(parts, dim=1).cpu().numpy()
-    return np.split(encoded, np.flatnonzero(np.diff(rollouts.episode)) + 1, axis=1)
+        episode[:] = torch.cat(parts, dim=1).cpu().numpy()
+    return encoded
 
 
 def sequence_batch(
