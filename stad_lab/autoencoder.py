@@ -177,10 +177,15 @@ def autoencoder_losses(
     if drawn_difference is not None:
         losses["difference_error"] = squared_error(drawn_difference, difference)
         total = total + settings.difference_weight * losses["difference_error"]
-    kl = 0.5 * (mu**2 + logvar.exp() - 1 - logvar).sum(dim=1)
+    kl = kl_divergence(mu, logvar).sum(dim=1)
     losses["kl"] = kl.mean()
     floor = settings.free_bits * settings.latent_size
     return {"total": total + settings.kl_weight * kl.clamp(min=floor).mean(), **losses}
+
+
+def kl_divergence(mu: torch.Tensor, logvar: torch.Tensor) -> torch.Tensor:
+    """KL divergence of N(mu, exp(logvar)) from N(0, 1) in nats, for every latent by itself; all shapes are equal."""
+    return 0.5 * (mu**2 + logvar.exp() - 1 - logvar)
 
 
 def squared_error(drawn: torch.Tensor, picture: torch.Tensor) -> torch.Tensor:

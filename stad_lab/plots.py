@@ -5,12 +5,15 @@ can tell apart; difference images lie on one diverging map centred at zero.
 """
 
 import io
+from collections.abc import Iterable
 
 import numpy as np
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from PIL import Image, ImageDraw, ImageFont
+
+from stad_lab.drives import Drive, Inside
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
@@ -132,15 +135,183 @@ def plot_mixture(
     return figure
 
 
-def plot_curves(curves: dict[str, np.ndarray], title: str, xlabel: str, ylabel: str) -> Figure:
-    """Lines over a common axis that counts 1, 2, 3, ..."""
+def plot_curves(
+    curves: dict[str, np.ndarray],
+    title: str,
+    xlabel: str,
+    ylabel: str,
+    x: np.ndarray | None = None,
+    marker: str = "",
+    **axis_settings,
+) -> Figure:
+    """Lines over a common axis.
+
+    Args:
+        x: of all lines; None to count 1, 2, 3, ...
+        marker: matplotlib's name of a mark at each point.
+        **axis_settings: of matplotlib's axis, for example `xscale="log"`.
+    """
     figure, ((axis,),) = new_figure(6.5, 3.2)
     for (name, values), color in zip(curves.items(), COLORS, strict=False):
-        axis.plot(np.arange(1, len(values) + 1), values, color=color, label=name)
-    axis.set(xlabel=xlabel, ylabel=ylabel)
-    axis.legend(frameon=False)
+        places = np.arange(1, len(values) + 1) if x is None else x
+        axis.plot(places, values, color=color, label=name, marker=marker)
+    axis.set(xlabel=xlabel, ylabel=ylabel, **axis_settings)
+    axis.legend(frameon=False, fontsize=9)
     axis.set_title(title, fontsize=11)
     figure.set_label(f"{title}. Lines: {', '.join(curves)}.")
+    return figure
+
+
+def plot_intervals(
+    panels: dict[str, dict[str, dict[str, tuple[float, list[float]]]]],
+    title: str,
+    xlabel: str,
+    columns: int = 3,
+    limits: tuple[float, float] | None = None,
+) -> Figure:
+    """Values with their intervals: a panel for each question, a row for each contender, a colour for each series.
+
+    Args:
+        panels: panel -> row -> series -> (value, [low, high]).
+        columns: panels beside each other.
+        limits: of the common horizontal axis; what lies further left is drawn at its edge.
+    """
+    lines = -(-len(panels) // columns)
+    rows = list(next(iter(panels.values())))
+    width = 2.0 + 2.5 * columns if columns > 1 else 6.5
+    figure, axes = new_figure(width, lines * (0.27 * len(rows) + 0.75) + 0.7, lines, columns, sharex=True, sharey=True)
+    names = list(dict.fromkeys(name for row in next(iter(panels.values())).values() for name in row))
+    for axis, (panel, contenders) in zip(axes.flat, panels.items(), strict=False):
+        for place, row in enumerate(rows):
+            for name, color, shift in zip(names, COLORS, (-0.14, 0.14) if len(names) > 1 else (0,), strict=False):
+                if name not in contenders[row]:
+                    continue
+                value, (low, high) = contenders[row][name]
+                if limits:
+                    value, low, high = (max(limits[0], number) for number in (value, low, high))
+                axis.plot([low, high], [place + shift] * 2, color=color, lw=2, alpha=0.5)
+                axis.plot(value, place + shift, "o", color=color, ms=5, label=name if place == 0 else None)
+        axis.set(yticks=range(len(rows)), yticklabels=rows, ylim=(len(rows) - 0.5, -0.5), xlim=limits)
+        axis.grid(axis="x", color="0.9")
+        axis.set_title(panel, fontsize=9)
+    for axis in axes[-1]:
+        axis.set_xlabel(xlabel, fontsize=9)
+    if len(names) > 1:
+        handles = [axes[0, 0].plot([], [], "o", color=c)[0] for _, c in zip(names, COLORS, strict=False)]
+        figure.legend(handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=11)
+    figure.set_label(f"{title}. Panels: {', '.join(filter(None, panels)) or 'one'}; rows: {', '.join(rows)}.")
+    return figure
+
+
+def plot_rate_distortion(rates: np.ndarray, errors: np.ndarray, names: list[str], title: str) -> Figure:
+    """What a latent tells (rate, nats) against what the drawing misses (distortion): a named point for each V."""
+    figure, ((axis,),) = new_figure(6.5, 3.4)
+    axis.plot(rates, errors, "o-", color=BLUE)
+    for rate, error, name in zip(rates, errors, names, strict=True):
+        axis.annotate(name, (rate, error), xytext=(6, 6), textcoords="offset points", fontsize=9)
+    axis.set(xlabel="rate: KL (nats)", ylabel="distortion: squared error")
+    axis.margins(0.12)
+    axis.set_title(title, fontsize=11)
+    points = ", ".join(
+        f"{name} {rate:.0f} nats, {error:.0f}" for name, rate, error in zip(names, rates, errors, strict=True)
+    )
+    figure.set_label(f"{title}. Points: {points}.")
+    return figure
+
+
+def plot_shares(shares: dict[str, np.ndarray], title: str, xlabel: str) -> Figure:
+    """Histograms of numbers in [0, 1] as outlines, each bar as a multiple of what a uniform one would have."""
+    figure, ((axis,),) = new_figure(6.5, 3.2)
+    for (name, share), color in zip(shares.items(), COLORS, strict=False):
+        axis.stairs(share * len(share), np.linspace(0, 1, len(share) + 1), color=color, lw=1.8, label=name)
+    axis.axhline(1, color="black", lw=1, ls="--", label="uniform")
+    axis.set(xlabel=xlabel, ylabel="density", ylim=(0, None))
+    axis.legend(frameon=False, fontsize=9)
+    axis.set_title(title, fontsize=11)
+    figure.set_label(f"{title}. Histograms of {', '.join(shares)} against a uniform one.")
+    return figure
+
+
+def plot_map(points: np.ndarray, colors: dict[str, np.ndarray], title: str) -> Figure:
+    """Points in the plane (n, 2), once for each name, coloured by that name's values (n,)."""
+    figure, axes = new_figure(3.3 * len(colors) + 0.4, 3.3, 1, len(colors), sharex=True, sharey=True)
+    for axis, (name, values) in zip(axes[0], colors.items(), strict=True):
+        low, high = np.quantile(values, [0.02, 0.98])
+        drawn = axis.scatter(*points.T, c=values, s=3, cmap="cividis", vmin=low, vmax=high)
+        axis.set(xticks=[], yticks=[], xlabel="first principal component")
+        axis.set_title(name, fontsize=9)
+        figure.colorbar(drawn, ax=axis, shrink=0.9)
+    axes[0, 0].set_ylabel("second")
+    figure.suptitle(title, fontsize=11)
+    figure.set_label(f"{title}. {len(points)} points, coloured by {', '.join(colors)}.")
+    return figure
+
+
+def plot_fit(x: np.ndarray, y: np.ndarray, samples: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
+    """Data points, and beside them what models would draw in their place: name -> (x, y)."""
+    figure, axes = new_figure(2.5 * (1 + len(samples)) + 0.3, 2.9, 1, 1 + len(samples), sharex=True, sharey=True)
+    for axis, (name, dots), color in zip(axes[0], {"data": (x, y), **samples}.items(), COLORS, strict=False):
+        axis.scatter(*dots, s=3, alpha=0.4, color=color)
+        axis.set_title(name, fontsize=9)
+        axis.set_xlabel("input")
+    axes[0, 0].set_ylabel("target")
+    figure.suptitle(title, fontsize=11)
+    figure.set_label(f"{title}. Panels: data, {', '.join(samples)}.")
+    return figure
+
+
+def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
+    """Everything about one moment of a drive: pictures, latents, forecast, action, and the return so far.
+
+    Args:
+        inside: what V and M make of the drive.
+        moment: which frame, 0 to len(drive) - 1.
+
+    Raises:
+        ValueError: a moment outside the drive.
+    """
+    if not 0 <= moment < len(drive):
+        raise ValueError(f"moment={moment}: expected 0 to {len(drive) - 1}, the drive has {len(drive)} frames")
+    figure = Figure(figsize=(9.5, 5.8), layout="constrained", dpi=100)
+    boxes = ["observation", "frame x", "difference d", "V's frame", "V's difference"]
+    below = ["z", "z", "weights", "weights", "action"]
+    axes = figure.subplot_mosaic([boxes, below, ["reward"] * 5], height_ratios=[1.7, 1, 0.5])
+    drawn = inside.drawn_differences
+    pictures = [
+        drive.observations[moment],
+        inside.frames[moment],
+        difference_colors(inside.differences[moment]),
+        inside.drawn_frames[moment],
+        None if drawn is None else difference_colors(drawn[moment]),
+    ]
+    for name, picture in zip(boxes, pictures, strict=True):
+        axes[name].set(xticks=[], yticks=[])
+        axes[name].set_title(name if picture is not None else "(d is not redrawn)", fontsize=9)
+        axes[name].spines[:].set_visible(False)
+        if picture is not None:
+            axes[name].imshow(picture, interpolation="nearest")
+    axes["z"].bar(np.arange(inside.mu.shape[1]), inside.mu[moment], color=BLUE, width=0.9)
+    reach = np.abs(inside.mu).max()
+    axes["z"].set(ylim=(-reach, reach), xlabel="latent", ylabel="z")
+    weights = inside.mixture.logpi[0, moment].exp().numpy().T
+    axes["weights"].imshow(weights, aspect="auto", cmap="cividis", vmin=0, vmax=1, interpolation="nearest")
+    axes["weights"].set(xlabel="latent", ylabel="Gaussian", yticks=[])
+    axes["weights"].set_title("M's mixture weights for the next z (yellow: 1)", fontsize=9)
+    names, values = ["steering", "gas", "brake"], drive.actions[moment]
+    axes["action"].barh(names, values, color=[ORANGE, GREEN, RED])
+    axes["action"].set(xlim=(-1, 1))
+    axes["action"].invert_yaxis()
+    axes["action"].axvline(0, color="black", lw=0.8)
+    axes["reward"].plot(drive.rewards.cumsum(), color=GREEN)
+    axes["reward"].axvline(moment, color="black", lw=1)
+    axes["reward"].set(xlabel="frame", ylabel="return so far", xlim=(0, len(drive) - 1))
+    speed = drive.motion[moment, 0]
+    title = (
+        f"Frame {moment} of {len(drive)}: speed {speed:.0f} world units per second, reward {drive.rewards[moment]:+.1f}"
+    )
+    figure.suptitle(title, fontsize=11)
+    figure.set_label(f"{title}. Observation, frame, difference, what V redraws, z, mixture weights, action, return.")
     return figure
 
 
@@ -259,6 +430,25 @@ def moving_picture(columns: dict[str, np.ndarray], fps: float = 25, size: int = 
     pages = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pages]
     buffer = io.BytesIO()
     pages[0].save(buffer, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
+    return buffer.getvalue()
+
+
+def moving_figure(figures: Iterable[Figure], fps: float, kind: str = "gif") -> bytes:
+    """Figures of one size as an animation, for readers without a kernel.
+
+    Args:
+        kind: "gif", or "webp", which is sharper and smaller.
+
+    Raises:
+        ValueError: another kind, or no figures.
+    """
+    if kind not in ("gif", "webp"):
+        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp'")
+    pages = [Image.open(io.BytesIO(to_png(figure))).convert("RGB") for figure in figures]
+    if not pages:
+        raise ValueError("no figures: expected at least one")
+    buffer = io.BytesIO()
+    pages[0].save(buffer, kind, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
     return buffer.getvalue()
 
 

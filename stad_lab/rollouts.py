@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from concurrent.futures import as_completed
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 from tqdm.auto import tqdm
 
@@ -22,13 +23,14 @@ from stad_lab.frames import FRAME_SIZE, earlier_index, to_frame
 from stad_lab.parallel import worker_processes
 from stad_lab.settings import Settings
 
-# Tracks are named by the seed of `env.reset`. The four uses never share one: an agent is reported on tracks that
-# nothing was trained or chosen on.
+# Tracks are named by the seed of `env.reset`. The uses never share one: an agent is reported on tracks that nothing was
+# trained or chosen on, and what V and M know is measured on tracks that they have not seen.
 TRACK_RANGES = {
     "test": (0, 1_000_000),
     "collect": (1_000_000, 2_000_000),
     "evolve": (2_000_000, 3_000_000),
     "validate": (3_000_000, 4_000_000),
+    "inspect": (4_000_000, 5_000_000),
 }
 NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array's shape is short
 FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
@@ -63,16 +65,20 @@ class RandomDriver:
         return np.array(action, np.float32)
 
 
-def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Drive episode number `index`: (frames uint8 (T, 64, 64, 3), actions float32 (T, 3), track seed).
+def begin_randomly(settings: Settings, index: int, use: str = "collect") -> tuple[gym.Env, np.ndarray, RandomDriver]:
+    """Put the car where the random driver's episode number `index` begins.
 
-    `actions[t]` is what the driver does on seeing `frames[t]`. Most episodes start moving on a random tile, or the data
-    would be nothing but the first bend and then grass.
+    Most episodes start moving on a random tile, or the data would be nothing but the first bend and then grass.
+
+    Args:
+        use: whose tracks to take, a key of TRACK_RANGES.
+
+    Returns:
+        The environment, its first observation, uint8 (96, 96, 3), and the driver.
     """
-    track = track_seeds("collect", settings.episodes, settings.seed)[index]
     rng = np.random.default_rng([settings.seed, index])
-    env = make_env(fast=True, bar=not settings.crop_bar)
-    observation, _ = env.reset(seed=track)
+    env = make_env(fast=True, bar=use != "collect" or not settings.crop_bar)
+    observation, _ = env.reset(seed=track_seeds(use, settings.episodes, settings.seed)[index])
     if rng.random() < settings.random_starts:
         observation = place_car(
             env,
@@ -81,7 +87,16 @@ def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarr
             turn=0.15 * rng.standard_normal(),
             offset=rng.uniform(-0.7, 0.7),
         )
-    driver, frames, actions = RandomDriver(rng), [], []
+    return env, observation, RandomDriver(rng)
+
+
+def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Drive episode number `index`: (frames uint8 (T, 64, 64, 3), actions float32 (T, 3), track seed).
+
+    `actions[t]` is what the driver does on seeing `frames[t]`.
+    """
+    env, observation, driver = begin_randomly(settings, index)
+    frames, actions = [], []
     for _ in range(settings.episode_frames):
         frames.append(to_frame(observation, settings.crop_bar))
         actions.append(driver.act())
@@ -89,7 +104,7 @@ def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarr
         if terminated or truncated:
             break
     env.close()
-    return np.array(frames), np.array(actions), track
+    return np.array(frames), np.array(actions), track_seeds("collect", settings.episodes, settings.seed)[index]
 
 
 def collect_block(settings: Settings, index: int, folder: Path) -> dict:

@@ -1,18 +1,26 @@
 """Thin ipywidgets around plots: show a figure, show a moving picture, and redraw a figure when a slider moves."""
 
 import base64
+import functools
 import html
 import inspect
+import io
 from collections.abc import Callable
 
 import ipywidgets
+import numpy as np
+import torch
 from IPython.display import HTML
 from matplotlib.figure import Figure
+from PIL import Image
 from pygments import highlight
 from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
-from stad_lab.plots import to_png
+from stad_lab.autoencoder import AutoEncoder
+from stad_lab.dream import to_uint8
+from stad_lab.drives import Drive, Inside
+from stad_lab.plots import difference_colors, plot_moment, to_png
 
 
 def show(figure: Figure) -> HTML:
@@ -75,3 +83,54 @@ def slider(low: float, high: float, value: float, label: str) -> ipywidgets.Widg
         continuous_update=False,
         style={"description_width": "initial"},
     )
+
+
+def view_drive(drive: Drive, inside: Inside) -> ipywidgets.VBox:
+    """The rollout viewer: everything about one moment of a drive, on a time slider."""
+    return explore(functools.partial(plot_moment, drive, inside), moment=slider(0, len(drive) - 1, 0, "frame"))
+
+
+def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
+    """One slider for each latent, and what V draws from them: the frame, and the difference if V redraws it.
+
+    A picture is drawn while a slider moves, in well under 100 ms: no figure is made, only the picture.
+
+    Args:
+        z: where the sliders begin, float32 (latent_size,).
+    """
+    pictures = [ipywidgets.Image(format="png", width=224, height=224) for _ in range(2)]
+    sliders = [
+        ipywidgets.FloatSlider(
+            round(float(value), 2), min=-4, max=4, step=0.05, description=f"z[{number}]", readout_format=".1f"
+        )
+        for number, value in enumerate(z)
+    ]
+
+    def redraw(_change=None) -> None:
+        for picture, drawn in zip(pictures, draw_latents(autoencoder, [s.value for s in sliders]), strict=False):
+            picture.value = drawn
+
+    for control in sliders:
+        control.layout.width = "230px"
+        control.observe(redraw, "value")
+    redraw()
+    shown = pictures if autoencoder.redraws_difference else pictures[:1]
+    grid = ipywidgets.GridBox(sliders, layout={"grid_template_columns": "repeat(4, 240px)"})
+    return ipywidgets.VBox([ipywidgets.HBox(shown), grid])
+
+
+@torch.no_grad()
+def draw_latents(autoencoder: AutoEncoder, z: list[float]) -> list[bytes]:
+    """What V draws from z, as PNGs of 224 x 224 pixels: the frame, and the difference if V redraws it."""
+    frame, difference = autoencoder.decode(torch.tensor([z], dtype=torch.float32))
+    pictures = [to_uint8(frame)[0]]
+    if difference is not None:
+        pictures.append(difference_colors(difference[0].permute(1, 2, 0).numpy()))
+    return [picture_png(picture, 224) for picture in pictures]
+
+
+def picture_png(picture: np.ndarray, size: int) -> bytes:
+    """A square uint8 picture (H, W, 3), enlarged to `size` pixels, as PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST).save(buffer, "png")
+    return buffer.getvalue()

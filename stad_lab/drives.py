@@ -1,0 +1,158 @@
+"""Drives: episodes kept whole, with the true motion of the car beside what it shows, and what V and M make of them.
+
+Training sees frames and actions only. Whoever asks what a latent knows about motion must know the motion: here it is
+read from the simulator. The tracks are from a range of their own ("inspect"), so that V and M have never seen them.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from stad_lab.agent import Agent
+from stad_lab.autoencoder import AutoEncoder, to_pictures
+from stad_lab.car_racing import TRACK_WIDTH, make_env
+from stad_lab.dream import to_uint8
+from stad_lab.frames import earlier_frames, episode_differences, to_frame
+from stad_lab.mdn_rnn import MDNRNN, Mixture
+from stad_lab.rollouts import begin_randomly
+from stad_lab.settings import Settings
+
+MOTION = {  # the columns of `Drive.motion`, with their units
+    "forward speed": "world units per second",
+    "slip speed": "world units per second, to the right",
+    "yaw rate": "radians per second, to the left",
+    "wheel angle": "radians, to the left",
+    "road offset": "half road widths, to the right",
+    "heading error": "radians, to the left",
+}
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One episode, T frames long; row t of each array belongs to the moment at which `observations[t]` is seen."""
+
+    observations: np.ndarray
+    """uint8 (T, 96, 96, 3)."""
+    actions: np.ndarray
+    """float32 (T, 3): what the driver did on seeing the observation."""
+    rewards: np.ndarray
+    """float32 (T,): what that action earned."""
+    motion: np.ndarray
+    """float32 (T, 6): the columns are the keys of MOTION."""
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    def frames(self, crop_bar: bool = True) -> np.ndarray:
+        """What V sees of it: uint8 (T, 64, 64, 3)."""
+        return np.array([to_frame(observation, crop_bar) for observation in self.observations])
+
+
+def true_motion(env: gym.Env) -> np.ndarray:
+    """How the car moves and where it is on the road, from the simulator: float32 (6,), as MOTION names them."""
+    car_racing = env.unwrapped
+    hull, track = car_racing.car.hull, np.array(car_racing.track)  # of a tile: progress, direction, x, y
+    along, across = (np.dot(hull.linearVelocity, hull.GetWorldVector(axis)) for axis in ((0, 1), (1, 0)))
+    _, direction, x, y = track[np.hypot(track[:, 2] - hull.position.x, track[:, 3] - hull.position.y).argmin()]
+    offset = (hull.position.x - x) * np.cos(direction) + (hull.position.y - y) * np.sin(direction)
+    turned = (hull.angle - direction + np.pi) % (2 * np.pi) - np.pi
+    wheel_angle = car_racing.car.wheels[0].joint.angle
+    return np.array([along, across, hull.angularVelocity, wheel_angle, offset / TRACK_WIDTH, turned], np.float32)
+
+
+def road_in_sight(motion: np.ndarray) -> np.ndarray:
+    """Whether the car is within 3 half road widths of the centre line and heads along the road: bool (T,).
+
+    Elsewhere a picture of grass is all there is, and no latent could tell where the road went.
+    """
+    names = list(MOTION)
+    offset, turned = motion[:, names.index("road offset")], motion[:, names.index("heading error")]
+    return (np.abs(offset) < 3) & (np.abs(turned) < np.pi / 2)
+
+
+def record(env: gym.Env, observation: np.ndarray, act: Callable[[np.ndarray], np.ndarray], frames: int) -> Drive:
+    """Drive on from `observation` for at most so many frames, and close the environment.
+
+    Args:
+        act: observation -> action, float32 (3,).
+    """
+    observations, actions, rewards, motion, ended = [], [], [], [], False
+    while len(actions) < frames and not ended:
+        observations.append(observation)
+        motion.append(true_motion(env))
+        actions.append(act(observation))
+        observation, reward, terminated, truncated, _ = env.step(actions[-1])
+        rewards.append(reward)
+        ended = terminated or truncated
+    env.close()
+    return Drive(np.array(observations), np.array(actions), np.array(rewards, np.float32), np.array(motion))
+
+
+def record_random_drive(settings: Settings, index: int) -> Drive:
+    """A drive of the random driver, as `rollouts.drive_randomly` makes them, but on a track kept for inspection."""
+    env, observation, driver = begin_randomly(settings, index, use="inspect")
+    return record(env, observation, lambda _: driver.act(), settings.episode_frames)
+
+
+def record_drive(agent: Agent, track: int, frames: int, fast: bool = True) -> Drive:
+    """A drive of an agent from the start of a track, at most `frames` long."""
+    env = make_env(fast)
+    observation, _ = env.reset(seed=track)
+    agent.reset()
+    return record(env, observation, agent.act, frames)
+
+
+@dataclass(frozen=True)
+class Inside:
+    """What V and M make of a drive of T frames."""
+
+    frames: np.ndarray
+    """What V saw: uint8 (T, 64, 64, 3)."""
+    differences: np.ndarray
+    """The difference images: float32 (T, 64, 64, 3) in [-1, 1]."""
+    drawn_frames: np.ndarray
+    """The frames that V redraws from mu: uint8 (T, 64, 64, 3)."""
+    drawn_differences: np.ndarray | None
+    """The differences that V redraws: float32 (T, 64, 64, 3); None if its variant does not."""
+    mu: np.ndarray
+    """Means of z: float32 (T, latent_size)."""
+    logvar: np.ndarray
+    """Logarithms of z's variances: float32 (T, latent_size)."""
+    hidden: np.ndarray
+    """M's memory before it sees the frame, which C is shown with z: float32 (T, hidden_size)."""
+    mixture: Mixture
+    """What M expects after the frame and the action: parts (1, T, latent_size, mixtures)."""
+
+
+@torch.no_grad()
+def encode_drive(
+    autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """What V makes of a drive: mu and logvar of z, float32 (T, latent_size) each."""
+    frames = drive.frames(crop_bar)
+    mu, logvar = autoencoder.encode(*to_pictures(frames, earlier_frames(frames, stride)))
+    return mu.numpy(), logvar.numpy()
+
+
+@torch.no_grad()
+def remember_drive(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, Mixture]:
+    """M's memory before every frame, float32 (T, hidden_size), and the mixture that it expects after it."""
+    seen = (torch.from_numpy(part)[None] for part in (latents, actions))
+    after, _ = mdn_rnn.remember(*seen, None)
+    before = torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)
+    return before[0].numpy(), mdn_rnn.mixture(after)
+
+
+@torch.no_grad()
+def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool = True) -> Inside:
+    """Show V and M a drive from its first frame on, and keep everything they make of it."""
+    frames = drive.frames(crop_bar)
+    mu, logvar = encode_drive(autoencoder, drive, stride, crop_bar)
+    hidden, mixture = remember_drive(mdn_rnn, mu, drive.actions)
+    drawn, changed = autoencoder.decode(torch.from_numpy(mu))
+    if changed is not None:
+        changed = changed.permute(0, 2, 3, 1).numpy()
+    return Inside(frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, logvar, hidden, mixture)

@@ -1,0 +1,65 @@
+"""Widgets without a browser: a moved slider draws another picture, soon; the viewer's film is a real animation."""
+
+import io
+import time
+
+import numpy as np
+import pytest
+from ipywidgets import FloatSlider, Image
+from PIL import Image as Picture
+
+from stad_lab.drives import look_inside, record_drive
+from stad_lab.film import film_inside
+from stad_lab.plots import moving_figure, plot_moment
+from stad_lab.widgets import explore_latents, view_drive
+
+
+def find(widget, kind):
+    """All widgets of a kind inside another."""
+    return ([widget] if isinstance(widget, kind) else []) + [
+        found for child in getattr(widget, "children", ()) for found in find(child, kind)
+    ]
+
+
+@pytest.fixture
+def inside(agent):
+    """A short drive and what V and M make of it."""
+    drive = record_drive(agent, track=4, frames=9)
+    return drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride)
+
+
+def test_the_latent_explorer_has_a_slider_for_each_latent_and_redraws_in_less_than_100_ms(agent):
+    explorer = explore_latents(agent.autoencoder, np.zeros(32, np.float32))
+    sliders, pictures = find(explorer, FloatSlider), find(explorer, Image)
+    assert len(sliders) == 32 and len(pictures) == 2
+    seconds = []
+    for number in range(9):
+        before = pictures[0].value
+        begin = time.perf_counter()
+        sliders[number].value = 3.0
+        seconds.append(time.perf_counter() - begin)
+        assert pictures[0].value != before
+    assert np.median(seconds) < 0.1
+
+
+def test_the_viewer_shows_another_picture_for_another_moment(inside):
+    viewer = view_drive(*inside)
+    control, picture = viewer.children
+    before = picture.value
+    control.value = 8
+    assert picture.value != before and "Frame 8 of 9" in picture.value
+
+
+def test_the_viewer_s_film_is_an_animation_for_readers_without_a_kernel(inside):
+    for kind in ("gif", "webp"):
+        film = Picture.open(io.BytesIO(film_inside(*inside, every=3, kind=kind)))
+        assert film.format.lower() == kind and film.n_frames == 3
+
+
+def test_what_cannot_be_shown_is_refused(inside):
+    with pytest.raises(ValueError, match="moment=9: expected 0 to 8"):
+        plot_moment(*inside, 9)
+    with pytest.raises(ValueError, match="kind='mp4': expected 'gif' or 'webp'"):
+        moving_figure([], 10, "mp4")
+    with pytest.raises(ValueError, match="no figures"):
+        moving_figure([], 10)
