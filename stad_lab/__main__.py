@@ -1,4 +1,4 @@
-"""The command line: python -m stad_lab train | evaluate | benchmark | film | ship."""
+"""The command line: python -m stad_lab train | evaluate | study | benchmark | film | ship."""
 
 import argparse
 import dataclasses
@@ -15,6 +15,8 @@ from stad_lab.evaluation import describe, evaluate
 from stad_lab.film import film_agent
 from stad_lab.pipeline import STAGES, ship, train
 from stad_lab.settings import PRESETS, Settings
+from stad_lab.study import PARTS as STUDY_PARTS
+from stad_lab.study import study
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -67,6 +69,20 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
     command.add_argument(
         "--json", type=Path, help="where to write the result; default evaluation-VARIANT.json in the run, or here"
+    )
+
+    command = commands.add_parser(
+        "study",
+        help="measure what the latents know, and how good V and M are",
+        description="Measure the V and M that come with stad_lab on unseen drives: a linear probe for the car's true"
+        " motion, V's errors, M's likelihood, calibration and dreams. What it compares them with is trained first,"
+        " which takes an hour or two; stop it when you like, the same command goes on.",
+    )
+    command.add_argument("--settings", help="preset of what is trained; default: as for train")
+    command.add_argument("--out", required=True, type=Path, help="folder for what is trained, and for study.json")
+    command.add_argument("--rollouts", type=Path, help="folder of the rollouts; default OUT/rollouts")
+    command.add_argument(
+        "--part", action="append", choices=list(STUDY_PARTS), help="only this part; may be repeated; default all"
     )
 
     command = commands.add_parser(
@@ -132,6 +148,11 @@ def main(arguments: list[str] | None = None) -> int:
             save_json(file, result)
             print(describe(result))
             print(f"  every episode: {file}")
+        elif options.command == "study":
+            settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
+            parts = options.part or list(STUDY_PARTS)
+            save_json(options.out / "study.json", study(settings, rollouts, options.out, parts))
+            print(f"every measurement: {options.out / 'study.json'}")
         elif options.command == "benchmark":
             save_json(options.json, benchmark(options.part or list(PARTS), options.rounds))
             print(f"\nevery measurement: {options.json}")
@@ -145,7 +166,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        again = "; the same command goes on from the last checkpoint" if options.command == "train" else ""
+        again = "; the same command goes on from the last checkpoint" if options.command in ("train", "study") else ""
         print(f"\nstopped{again}", file=sys.stderr)
         return 130
     return 0

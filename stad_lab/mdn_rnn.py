@@ -79,15 +79,23 @@ class MDNRNN(nn.Module):
         return Mixture(logits.log_softmax(-1), mean, logsigma.clamp(*LOGSIGMA_RANGE))
 
 
-def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
-    """Negative log-likelihood of `target` (batch, time, latent_size) in nats for each latent dimension, a scalar.
+def log_likelihood(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
+    """Logarithm of the density of each entry of `target` (batch, time, latent_size) in nats, of the same shape.
 
-    -log sum_k pi_k N(target; mean_k, sigma_k), with the sum inside a logsumexp: densities of latents far from every
-    mean underflow to zero, their logarithms do not. It is a density, so the loss can honestly be negative.
+    log sum_k pi_k N(target; mean_k, sigma_k), with the sum inside a logsumexp: densities of latents far from every
+    mean underflow to zero, their logarithms do not.
     """
     error = (target[..., None] - mixture.mean) * torch.exp(-mixture.logsigma)
     log_density = -0.5 * error**2 - mixture.logsigma - 0.5 * math.log(2 * math.pi)
-    return -torch.logsumexp(mixture.logpi + log_density, dim=-1).mean()
+    return torch.logsumexp(mixture.logpi + log_density, dim=-1)
+
+
+def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
+    """Negative log-likelihood of `target` (batch, time, latent_size) in nats for each latent dimension, a scalar.
+
+    It is the logarithm of a density, so it can honestly be negative.
+    """
+    return -log_likelihood(mixture, target).mean()
 
 
 def sample_mixture(mixture: Mixture, temperature: float, generator: torch.Generator | None = None) -> torch.Tensor:
@@ -174,9 +182,29 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)
     encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
     first_heldout = rollouts.episode[rollouts.split()[1][0]]
+    checkpoint = path.with_name("mdn_rnn.training.safetensors")
+    history = fit_mdn_rnn(mdn_rnn, encoded, rollouts.actions, first_heldout, settings, checkpoint)
+    save_mdn_rnn(path, mdn_rnn, variant, history)
+    checkpoint.unlink()
+    return True
+
+
+def fit_mdn_rnn(
+    mdn_rnn: MDNRNN,
+    encoded: list[np.ndarray],
+    actions: list[np.ndarray],
+    first_heldout: int,
+    settings: Settings,
+    checkpoint: Path,
+) -> list[dict]:
+    """Train M in place on encoded episodes (see `encode_rollouts`) and their actions; returns `fit`'s history.
+
+    Training has a fixed length. Episodes from `first_heldout` on are held out.
+    """
+    device = next(mdn_rnn.parameters()).device
 
     def draw(episodes: slice, batch: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
-        return sequence_batch(encoded[episodes], rollouts.actions[episodes], settings.m_sequence, batch, rng)
+        return sequence_batch(encoded[episodes], actions[episodes], settings.m_sequence, batch, rng)
 
     def batch(step: int) -> tuple[torch.Tensor, torch.Tensor]:
         return draw(slice(first_heldout), settings.m_batch, np.random.default_rng([settings.seed, 2, step]))
@@ -190,13 +218,9 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     def heldout_losses() -> dict[str, float]:
         return {"total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))["total"].item()}
 
-    checkpoint = path.with_name("mdn_rnn.training.safetensors")
-    history = fit(
+    return fit(
         mdn_rnn, batch, losses, heldout_losses, settings.m_steps, settings.m_learning_rate, checkpoint, "train M"
     )
-    save_mdn_rnn(path, mdn_rnn, variant, history)
-    checkpoint.unlink()
-    return True
 
 
 def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list) -> None:

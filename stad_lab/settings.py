@@ -142,7 +142,7 @@ class Settings:
 
 
 ZERO_ALLOWED = ("seed", "patience", "random_starts", "kl_weight", "free_bits", "difference_weight")
-AT_LEAST = {"episodes": 2, "population": 4, "m_sequence": 2, "initial_gas": -100.0}
+AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
 
 
 def check_value(name: str, kind: type, value) -> None:

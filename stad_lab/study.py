@@ -1,0 +1,269 @@
+"""The study: what the latents know, measured on drives that nothing was trained on. Its record is what we report.
+
+    probe        how well six numbers of the car's true motion can be read off z, and off z and h, in every variant, in
+                 a V without training, and for other strides
+    autoencoder  the quality of V in every variant, and rate against distortion over the weight of the KL
+    mdn_rnn      the quality of M: its NLL beside simple forecasts and lesser M's, its calibration, its dreams' error
+
+The V and M that come with stad_lab are measured. What else the comparison needs is trained in a working folder, on the
+rollouts that those were trained on, and an interrupted study goes on where it stopped.
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import numpy as np
+import torch
+from tqdm.auto import tqdm
+
+from stad_lab.agent import load_agent, load_world_model, run_folder
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder
+from stad_lab.drives import (
+    MOTION,
+    Drive,
+    encode_drive,
+    record_drive,
+    record_random_drive,
+    remember_drive,
+    road_in_sight,
+)
+from stad_lab.frames import earlier_frames
+from stad_lab.mdn_rnn import MDNRNN, encode_rollouts, fit_mdn_rnn, load_mdn_rnn, save_mdn_rnn
+from stad_lab.parallel import worker_processes
+from stad_lab.pipeline import provenance, train
+from stad_lab.probe import probe
+from stad_lab.quality import (
+    autoencoder_quality,
+    dream_with,
+    forecast,
+    horizon_errors,
+    linear_forecast,
+    mixture_nll,
+    pit,
+    repeat_forecast,
+)
+from stad_lab.rollouts import Rollouts, collect_rollouts, track_seeds
+from stad_lab.settings import Settings
+
+STRIDES = (1, 2, 4, 8)
+KL_WEIGHTS = (0.02, 0.08, 0.25, 1.0, 4.0, 16.0)
+SHORTER = 0.3  # the V's of the comparisons are trained for this share of the steps, all of them alike
+CONTENDERS = {  # lesser M's: what is changed, and whether they see the actions
+    "one Gaussian": ({"mixtures": 1}, True),
+    "no actions": ({}, False),
+    "no memory": ({"m_sequence": 1, "m_batch": 3200}, True),
+}
+DRIVE_FRAMES, AGENT_FRAMES = 150, 300  # of a drive of the random driver, and of the agent
+RECORD = Path(__file__).parent / "records" / "study.json"  # the study that we report
+AWAKE, ASLEEP = 30, 100  # frames that M sees before a dream, and frames that it dreams
+
+
+def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str]) -> dict:
+    """Measure the parts of the study.
+
+    Args:
+        settings: of the rollouts, and of what is trained here; `laptop` is what the shipped V and M were made with.
+        rollouts_folder: collected if they are not there.
+        work: folder for what is trained.
+        parts: some of PARTS.
+
+    Returns:
+        A dict for JSON, one entry for each part, and "made_with".
+    """
+    check_parts(parts)
+    collect_rollouts(settings, rollouts_folder)
+    drives = random_drives(max(12, settings.episodes // 5), settings.processes)
+    run = {name: PARTS[name](settings, Path(rollouts_folder), Path(work), drives) for name in parts}
+    command = f"python -m stad_lab study --settings {settings.name}"
+    return {"settings": settings.as_dict(), "drives": len(drives), **run, "made_with": provenance(command)}
+
+
+def check_parts(parts: list[str]) -> None:
+    """Raise ValueError unless every part is one of PARTS."""
+    for part in parts:
+        if part not in PARTS:
+            raise ValueError(f"unknown part {part!r}: choose from {', '.join(PARTS)}")
+
+
+def random_drives(count: int, processes: int) -> list[Drive]:
+    """Drives of the random driver on tracks kept for inspection."""
+    settings = Settings.preset("laptop", seed=1, episodes=count, episode_frames=DRIVE_FRAMES)
+    with worker_processes(processes) as executor:
+        drives = executor.map(functools.partial(record_random_drive, settings), range(count))
+        return list(tqdm(drives, "random drives", count, unit="drive"))
+
+
+def agent_drives(count: int, processes: int) -> list[Drive]:
+    """The beginnings of drives of the shipped `input` agent: the road at speed, which no random driver sees."""
+    with worker_processes(processes) as executor:
+        drives = executor.map(begin_agent_drive, track_seeds("inspect", count, 2))
+        return list(tqdm(drives, "agent drives", count, unit="drive"))
+
+
+def begin_agent_drive(track: int) -> Drive:
+    """The first frames of a drive of the shipped `input` agent. Runs in a worker process."""
+    return record_drive(load_agent("input"), track, AGENT_FRAMES)
+
+
+def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
+    """Probe the latents of every variant, and of every stride, for the true motion, under two drivers."""
+    drivers = {"random driver": drives, "trained agent": agent_drives(max(12, len(drives) // 3), settings.processes)}
+    torch.manual_seed(settings.seed)
+    untrained = {
+        f"{name}, untrained": AutoEncoder(name, settings.latent_size, settings.width)
+        for name in ("frame", "input_output")
+    }
+    strides = {str(stride): shorter_autoencoder(settings, rollouts_folder, work, stride=stride) for stride in STRIDES}
+    result = {"variants": {}, "strides": {}}
+    for driver, driven in drivers.items():
+        found = result["variants"][driver] = {}
+        for variant in VARIANTS:
+            autoencoder, mdn_rnn, stride, crop_bar = load_world_model(run_folder(variant), variant)
+            found[variant] = probe_drives(driven, autoencoder, mdn_rnn, stride, crop_bar)
+        for name, autoencoder in untrained.items():
+            found[name] = probe_drives(driven, autoencoder, None, settings.stride, settings.crop_bar)
+        found = result["strides"][driver] = {}
+        for stride, autoencoder in strides.items():
+            found[stride] = probe_drives(driven, autoencoder, None, int(stride), settings.crop_bar)
+    return result
+
+
+def probe_drives(
+    drives: list[Drive], autoencoder: AutoEncoder, mdn_rnn: MDNRNN | None, stride: int, crop_bar: bool
+) -> dict:
+    """Probe z, and with M also z with h: {"z": {quantity: {"r2", "interval"}}, "z, h": ...}."""
+    latents = [encode_drive(autoencoder, drive, stride, crop_bar)[0] for drive in drives]
+    features = {"z": np.concatenate(latents)}
+    if mdn_rnn is not None:
+        hidden = [remember_drive(mdn_rnn, z, drive.actions)[0] for z, drive in zip(latents, drives, strict=True)]
+        features["z, h"] = np.concatenate([features["z"], np.concatenate(hidden)], axis=1)
+    motion = np.concatenate([drive.motion for drive in drives])
+    number = np.repeat(np.arange(len(drives)), [len(drive) for drive in drives])
+    kept = road_in_sight(motion)
+    result = {}
+    for name, seen in features.items():
+        found = probe(seen[kept], motion[kept], number[kept])
+        result[name] = {
+            quantity: {"r2": float(r2), "interval": [float(low), float(high)]}
+            for quantity, r2, low, high in zip(MOTION, *found.values(), strict=True)
+        }
+    return result
+
+
+def probe_panels(found: dict) -> dict:
+    """What `probe_part` found under one driver, as `plots.plot_intervals` wants it: quantity -> source -> features."""
+    return {
+        quantity: {
+            source: {name: (r2s[quantity]["r2"], r2s[quantity]["interval"]) for name, r2s in by_features.items()}
+            for source, by_features in found.items()
+        }
+        for quantity in MOTION
+    }
+
+
+def shorter_autoencoder(settings: Settings, rollouts_folder: Path, work: Path, **changes) -> AutoEncoder:
+    """V of the variant `input_output`, trained with `changes` for a share of the steps; loaded if it is there."""
+    settings = dataclasses.replace(settings, v_steps=round(SHORTER * settings.v_steps), **changes)
+    if changes == {"kl_weight": Settings.preset(settings.name).kl_weight}:
+        changes = {"stride": settings.stride}  # the run without a change is the same run for both comparisons
+    folder = work / "_".join(f"{name}_{value:g}" for name, value in changes.items())
+    train("input_output", settings, folder, rollouts_folder, until="autoencoder")
+    return load_autoencoder(folder / "autoencoder.safetensors", "input_output")[0]
+
+
+def autoencoder_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
+    """Measure V of every variant, and rate against distortion."""
+
+    def measure(autoencoder: AutoEncoder, stride: int, crop_bar: bool) -> dict:
+        films = [drive.frames(crop_bar) for drive in drives]
+        pairs = [(film[stride::3], earlier_frames(film, stride)[stride::3]) for film in films]
+        return autoencoder_quality(autoencoder, *(np.concatenate(part) for part in zip(*pairs, strict=True)))
+
+    variants = {}
+    for variant in VARIANTS:
+        autoencoder, facts = load_autoencoder(run_folder(variant) / "autoencoder.safetensors", variant)
+        variants[variant] = measure(autoencoder, facts["stride"], facts["crop_bar"])
+    rate_distortion = {}
+    for weight in KL_WEIGHTS:
+        autoencoder = shorter_autoencoder(settings, rollouts_folder, work, kl_weight=weight)
+        rate_distortion[f"{weight:g}"] = measure(autoencoder, settings.stride, settings.crop_bar)
+    return {"variants": variants, "rate_distortion": rate_distortion}
+
+
+def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
+    """Measure M of every variant; for `input` also the lesser M's."""
+    whole = [drive for drive in drives if len(drive) == DRIVE_FRAMES]
+    actions = np.array([drive.actions for drive in whole])
+    result = {"drives": len(whole), "variants": {}}
+    for variant in VARIANTS:
+        autoencoder, mdn_rnn, stride, crop_bar = load_world_model(run_folder(variant), variant)
+        mu, logvar = (
+            np.array(part)
+            for part in zip(*(encode_drive(autoencoder, drive, stride, crop_bar) for drive in whole), strict=True)
+        )
+        z = mu + np.exp(0.5 * logvar) * np.random.default_rng(0).standard_normal(mu.shape, np.float32)
+        mixture = forecast(mdn_rnn, z, actions)
+        counts, _ = np.histogram(pit(mixture, z), bins=20, range=(0, 1))
+        dreamed = dream_with(mdn_rnn, mu, actions, AWAKE)[:, :, :ASLEEP]
+        errors = horizon_errors(dreamed, mu[:, : AWAKE + ASLEEP], AWAKE)
+        result["variants"][variant] = {
+            "nll": {"M": mixture_nll(mixture, z), **simple_forecasts(z, actions)},
+            "pit": (counts / counts.sum()).tolist(),
+            "horizon": {name: error.tolist() for name, error in errors.items()},
+        }
+        if variant == "input":
+            lesser = lesser_forecasts(settings, rollouts_folder, work, autoencoder, z, actions)
+            result["variants"][variant]["nll"] |= lesser
+    for found in result["variants"].values():
+        found["nll"] = {name: over_drives(nll[len(nll) // 2 :]) for name, nll in found["nll"].items()}
+    return result
+
+
+def simple_forecasts(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
+    """NLL of forecasts without a network, fitted on the first half of the drives, for all of them."""
+    half = len(z) // 2
+    return {
+        "repeat the last z": repeat_forecast(z[:half], z),
+        "linear, last z": linear_forecast(z[:half], actions[:half], z, actions, order=1),
+        "linear, last 4 z": linear_forecast(z[:half], actions[:half], z, actions, order=4),
+    }
+
+
+def lesser_forecasts(
+    settings: Settings, rollouts_folder: Path, work: Path, autoencoder: AutoEncoder, z: np.ndarray, actions: np.ndarray
+) -> dict[str, np.ndarray]:
+    """NLL of M's that lack something, trained like the whole one on the same data."""
+    rollouts, encoded, result = Rollouts(rollouts_folder), None, {}
+    for name, (changes, sees_actions) in CONTENDERS.items():
+        path = work / name.replace(" ", "_") / "mdn_rnn.safetensors"
+        lesser = dataclasses.replace(settings, **changes)
+        if not path.exists():
+            encoded = encoded or encode_rollouts(autoencoder, rollouts, settings.stride)
+            torch.manual_seed(settings.seed)
+            mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures)
+            shown = [action * sees_actions for action in rollouts.actions]
+            first_heldout = rollouts.episode[rollouts.split()[1][0]]
+            checkpoint = path.with_name("mdn_rnn.training.safetensors")
+            history = fit_mdn_rnn(mdn_rnn, encoded, shown, first_heldout, lesser, checkpoint)
+            save_mdn_rnn(path, mdn_rnn, "input", history)
+        mdn_rnn, _ = load_mdn_rnn(path, "input")
+        if lesser.m_sequence > 1:
+            result[name] = mixture_nll(forecast(mdn_rnn, z, actions * sees_actions), z)
+        else:  # every pair of frames is a sequence of its own
+            pairs = np.stack([z[:, :-1], z[:, 1:]], axis=2).reshape(-1, 2, z.shape[2])
+            moments = np.repeat(actions[:, :-1].reshape(-1, 1, actions.shape[2]), 2, axis=1)
+            nll = mixture_nll(forecast(mdn_rnn, pairs, moments), pairs)
+            result[name] = nll.reshape(len(z), -1, z.shape[2])
+    return result
+
+
+def over_drives(nll: np.ndarray) -> dict:
+    """Mean of (drives, frames, latents) over everything, with a bootstrap interval over drives; the first 3 frames of
+    the longest forecasts are left out, so that all are judged on the same frames."""
+    means = nll[:, -(DRIVE_FRAMES - 4) :].mean(axis=(1, 2))
+    again = np.random.default_rng(0).choice(means, (1000, len(means))).mean(axis=1)
+    return {"nats": float(means.mean()), "interval": [float(bound) for bound in np.percentile(again, [2.5, 97.5])]}
+
+
+PARTS = {"probe": probe_part, "autoencoder": autoencoder_part, "mdn_rnn": mdn_rnn_part}

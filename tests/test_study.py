@@ -1,0 +1,71 @@
+"""The study: the real command measures what is shipped, goes on where it stopped, and its record is reported."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from stad_lab.autoencoder import VARIANTS, AutoEncoder
+from stad_lab.checkpoints import load_json
+from stad_lab.drives import MOTION, record_random_drive
+from stad_lab.settings import Settings
+from stad_lab.study import (
+    CONTENDERS,
+    over_drives,
+    probe_drives,
+    probe_panels,
+    study,
+)
+
+
+@pytest.fixture(scope="module")
+def measured(command_line, quick_run, tmp_path_factory):
+    """M's part of a study, by the real command on the quick run's rollouts: (folder, process)."""
+    folder = tmp_path_factory.mktemp("study")
+    arguments = ("--settings", "quick", "--out", folder, "--rollouts", quick_run / "rollouts", "--part", "mdn_rnn")
+    return folder, arguments, command_line("study", *arguments)
+
+
+def test_the_command_measures_m_against_simple_forecasts_and_lesser_m_s(measured):
+    folder, _, process = measured
+    assert process.returncode == 0, process.stderr
+    result = json.loads((folder / "study.json").read_text())
+    assert set(result["mdn_rnn"]["variants"]) == set(VARIANTS)
+    nll = result["mdn_rnn"]["variants"]["input"]["nll"]
+    assert set(CONTENDERS) < set(nll) and all(v["interval"][0] <= v["nats"] <= v["interval"][1] for v in nll.values())
+    assert nll["M"]["nats"] < nll["repeat the last z"]["nats"]
+    for found in result["mdn_rnn"]["variants"].values():
+        assert sum(found["pit"]) == pytest.approx(1) and len(found["horizon"]["one dream"]) == 100
+
+
+def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, command_line):
+    folder, arguments, _ = measured
+    first = load_json(folder / "study.json")
+    weights = (folder / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns
+    shutil.rmtree(folder / "no_memory")  # as if it had been stopped before
+    process = command_line("study", *arguments)
+    assert process.returncode == 0 and process.stdout.count("train M") == 0
+    assert load_json(folder / "study.json")["mdn_rnn"] == first["mdn_rnn"]
+    assert (folder / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns == weights
+
+
+def test_an_unknown_part_is_refused_before_any_work(tmp_path):
+    with pytest.raises(ValueError, match="unknown part 'probes': choose from probe, autoencoder, mdn_rnn"):
+        study(Settings.preset("quick"), tmp_path / "rollouts", tmp_path, ["probes"])
+    assert not any(tmp_path.iterdir())
+
+
+def test_drives_are_probed_for_every_motion_and_shown_by_motion():
+    settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
+    drives = [record_random_drive(settings, index) for index in range(12)]
+    found = probe_drives(drives, AutoEncoder("input_output", width=4), None, settings.stride, settings.crop_bar)
+    assert list(found) == ["z"] and set(found["z"]) == set(MOTION)
+    panels = probe_panels({"untrained": found})
+    assert panels["yaw rate"]["untrained"]["z"][0] == found["z"]["yaw rate"]["r2"]
+
+
+def test_all_forecasts_are_judged_on_the_same_frames():
+    nll = np.zeros((5, 149, 2))
+    nll[:, :3] = 100  # frames that a forecast from the last four z's cannot have
+    assert over_drives(nll)["nats"] == over_drives(nll[:, 3:])["nats"] == 0
