@@ -12,6 +12,7 @@ from stad_lab.autoencoder import VARIANTS, load_autoencoder
 from stad_lab.checkpoints import checksum
 from stad_lab.evaluation import summarise
 from stad_lab.evolution import fitness_curves
+from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.rollouts import TRACK_RANGES, track_seeds
 from stad_lab.settings import Settings
 
@@ -24,7 +25,7 @@ def read(variant, name):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_v_of_every_variant_is_shipped_with_its_record(variant):
+def test_v_and_m_of_every_variant_are_shipped_with_their_record(variant):
     _, facts = load_autoencoder(PRETRAINED / variant / "autoencoder.safetensors", variant)
     record = read(variant, "record.json")
     settings = Settings.from_dict(record["settings"])
@@ -35,6 +36,8 @@ def test_v_of_every_variant_is_shipped_with_its_record(variant):
         settings.width,
     )
     assert facts["history"][-1]["step"] == settings.v_steps
+    _, m_facts = load_mdn_rnn(PRETRAINED / variant / "mdn_rnn.safetensors", variant, settings.latent_size)
+    assert m_facts["history"][-1]["step"] == settings.m_steps
     assert record["made_with"]["commit"] and not record["made_with"]["uncommitted_changes"]
 
 
