@@ -12,7 +12,7 @@ from stad_lab.autoencoder import VARIANTS
 from stad_lab.benchmark import PARTS, benchmark
 from stad_lab.checkpoints import save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
-from stad_lab.film import film_agent
+from stad_lab.film import film_agent, film_viewer
 from stad_lab.pipeline import STAGES, ship, train
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
@@ -109,7 +109,10 @@ def build_parser() -> argparse.ArgumentParser:
         description="Observation, difference image and reconstruction side by side, as an animated GIF.",
     )
     command.add_argument("--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab")
-    command.add_argument("--out", type=Path, required=True, help="the GIF to write")
+    command.add_argument("--out", type=Path, required=True, help="the GIF to write; with --viewer it may be a .webp")
+    command.add_argument(
+        "--viewer", action="store_true", help="film everything: latents, forecast, action and return too"
+    )
     command.add_argument("--track", type=int, default=5, help="seed of the track, default 5")
     command.add_argument("--first", type=int, default=60, help="first frame shown, default 60: after the opening zoom")
     command.add_argument("--frames", type=int, default=240, help="frames covered, default 240; every third is shown")
@@ -160,7 +163,9 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"shipped to {ship(options.variant, options.path)}")
         elif options.command == "film":
             agent = load_agent(options.variant, options.path)
-            write_bytes(options.out, film_agent(agent, options.track, options.first, options.frames))
+            shown = (agent, options.track, options.first, options.frames)
+            kind = options.out.suffix.lstrip(".").lower()
+            write_bytes(options.out, film_viewer(*shown, kind=kind) if options.viewer else film_agent(*shown))
             print(f"filmed to {options.out}")
     except (ValueError, OSError, FloatingPointError, BrokenProcessPool) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -6,7 +6,7 @@ from tqdm.auto import tqdm
 from stad_lab.agent import Agent
 from stad_lab.autoencoder import to_pictures
 from stad_lab.dream import to_uint8
-from stad_lab.drives import Drive, Inside, record_drive
+from stad_lab.drives import Drive, Inside, look_inside, record_drive
 from stad_lab.frames import earlier_frames
 from stad_lab.plots import difference_colors, moving_figure, moving_picture, plot_moment
 
@@ -24,9 +24,7 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
     Raises:
         ValueError: the episode ends before `first`.
     """
-    drive = record_drive(agent, track, first + frames)
-    if len(drive) <= first:
-        raise ValueError(f"first={first}, but on track {track} the episode ends after {len(drive)} frames")
+    drive = record_longer_drive(agent, track, first, frames)
     film = drive.frames(agent.crop_bar)
     earlier = earlier_frames(film, agent.stride)
     shown = slice(first, None, every)
@@ -39,7 +37,29 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
     return moving_picture(columns, fps=50 / every)
 
 
-def film_inside(drive: Drive, inside: Inside, every: int = 3, kind: str = "gif") -> bytes:
+def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 3, kind: str = "gif") -> bytes:
+    """The rollout viewer while the agent drives, as an animation; arguments as for `film_agent`.
+
+    Args:
+        kind: "gif" or "webp".
+
+    Raises:
+        ValueError: the episode ends before `first`, or another kind.
+    """
+    drive = record_longer_drive(agent, track, first, frames)
+    inside = look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
+    return film_inside(drive, inside, first, every, kind)
+
+
+def film_inside(drive: Drive, inside: Inside, first: int = 0, every: int = 3, kind: str = "gif") -> bytes:
     """The rollout viewer as an animation, "gif" or "webp": one moment in `every`, at the real speed."""
-    moments = tqdm(range(0, len(drive), every), "film", unit="picture")
+    moments = tqdm(range(first, len(drive), every), "film", unit="picture")
     return moving_figure((plot_moment(drive, inside, moment) for moment in moments), 50 / every, kind)
+
+
+def record_longer_drive(agent: Agent, track: int, first: int, frames: int) -> Drive:
+    """Record a drive of at most `first + frames` frames. Raises ValueError if it ends before frame `first`."""
+    drive = record_drive(agent, track, first + frames)
+    if len(drive) <= first:
+        raise ValueError(f"first={first}, but on track {track} the episode ends after {len(drive)} frames")
+    return drive

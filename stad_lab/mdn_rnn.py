@@ -93,7 +93,7 @@ def log_likelihood(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
 def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
     """Negative log-likelihood of `target` (batch, time, latent_size) in nats for each latent dimension, a scalar.
 
-    It is the logarithm of a density, so it can honestly be negative.
+    It is minus the logarithm of a density, so it can honestly be negative.
     """
     return -log_likelihood(mixture, target).mean()
 

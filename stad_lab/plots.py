@@ -174,23 +174,23 @@ def plot_intervals(
     Args:
         panels: panel -> row -> series -> (value, [low, high]).
         columns: panels beside each other.
-        limits: of the common horizontal axis; what lies further left is drawn at its edge.
+        limits: of the common horizontal axis; a value further left is marked by an arrow at the edge.
     """
     lines = -(-len(panels) // columns)
     rows = list(next(iter(panels.values())))
     width = 2.0 + 2.5 * columns if columns > 1 else 6.5
-    figure, axes = new_figure(width, lines * (0.27 * len(rows) + 0.75) + 0.7, lines, columns, sharex=True, sharey=True)
+    figure, axes = new_figure(width, lines * (0.32 * len(rows) + 0.75) + 0.7, lines, columns, sharex=True, sharey=True)
     names = list(dict.fromkeys(name for row in next(iter(panels.values())).values() for name in row))
+    shifts = np.linspace(-0.2, 0.2, len(names)) if len(names) > 1 else [0]
     for axis, (panel, contenders) in zip(axes.flat, panels.items(), strict=False):
         for place, row in enumerate(rows):
-            for name, color, shift in zip(names, COLORS, (-0.14, 0.14) if len(names) > 1 else (0,), strict=False):
+            for name, color, shift in zip(names, COLORS, shifts, strict=False):
                 if name not in contenders[row]:
                     continue
-                value, (low, high) = contenders[row][name]
-                if limits:
-                    value, low, high = (max(limits[0], number) for number in (value, low, high))
-                axis.plot([low, high], [place + shift] * 2, color=color, lw=2, alpha=0.5)
-                axis.plot(value, place + shift, "o", color=color, ms=5, label=name if place == 0 else None)
+                value, interval = contenders[row][name]
+                outside = limits is not None and value < limits[0]
+                axis.plot(interval, [place + shift] * 2, color=color, lw=2, alpha=0.5)
+                axis.plot(limits[0] if outside else value, place + shift, "<" if outside else "o", color=color, ms=5)
         axis.set(yticks=range(len(rows)), yticklabels=rows, ylim=(len(rows) - 0.5, -0.5), xlim=limits)
         axis.grid(axis="x", color="0.9")
         axis.set_title(panel, fontsize=9)
@@ -211,7 +211,7 @@ def plot_rate_distortion(rates: np.ndarray, errors: np.ndarray, names: list[str]
     for rate, error, name in zip(rates, errors, names, strict=True):
         axis.annotate(name, (rate, error), xytext=(6, 6), textcoords="offset points", fontsize=9)
     axis.set(xlabel="rate: KL (nats)", ylabel="distortion: squared error")
-    axis.margins(0.12)
+    axis.margins(0.18)
     axis.set_title(title, fontsize=11)
     points = ", ".join(
         f"{name} {rate:.0f} nats, {error:.0f}" for name, rate, error in zip(names, rates, errors, strict=True)
@@ -273,39 +273,37 @@ def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
     """
     if not 0 <= moment < len(drive):
         raise ValueError(f"moment={moment}: expected 0 to {len(drive) - 1}, the drive has {len(drive)} frames")
-    figure = Figure(figsize=(9.5, 5.8), layout="constrained", dpi=100)
-    boxes = ["observation", "frame x", "difference d", "V's frame", "V's difference"]
-    below = ["z", "z", "weights", "weights", "action"]
-    axes = figure.subplot_mosaic([boxes, below, ["reward"] * 5], height_ratios=[1.7, 1, 0.5])
-    drawn = inside.drawn_differences
-    pictures = [
-        drive.observations[moment],
-        inside.frames[moment],
-        difference_colors(inside.differences[moment]),
-        inside.drawn_frames[moment],
-        None if drawn is None else difference_colors(drawn[moment]),
-    ]
-    for name, picture in zip(boxes, pictures, strict=True):
-        axes[name].set(xticks=[], yticks=[])
-        axes[name].set_title(name if picture is not None else "(d is not redrawn)", fontsize=9)
-        axes[name].spines[:].set_visible(False)
-        if picture is not None:
-            axes[name].imshow(picture, interpolation="nearest")
-    axes["z"].bar(np.arange(inside.mu.shape[1]), inside.mu[moment], color=BLUE, width=0.9)
+    figure = Figure(figsize=(9.5, 5.6), layout="constrained", dpi=100)
+    above, middle, below = figure.subfigures(3, 1, height_ratios=[1.6, 1.25, 0.8])
+    pictures = {
+        "observation": drive.observations[moment],
+        "frame x": inside.frames[moment],
+        "difference d": difference_colors(inside.differences[moment]),
+        "V's frame": inside.drawn_frames[moment],
+    }
+    if inside.drawn_differences is not None:
+        pictures["V's difference"] = difference_colors(inside.drawn_differences[moment])
+    for (name, picture), axis in zip(pictures.items(), above.subplots(1, len(pictures)), strict=True):
+        axis.imshow(picture, interpolation="nearest")
+        axis.set(xticks=[], yticks=[])
+        axis.set_title(name, fontsize=9)
+        axis.spines[:].set_visible(False)
+    latents, weights, action = middle.subplots(1, 3, width_ratios=[2, 2, 1])
+    latents.bar(np.arange(inside.mu.shape[1]), inside.mu[moment], color=BLUE, width=0.9)
     reach = np.abs(inside.mu).max()
-    axes["z"].set(ylim=(-reach, reach), xlabel="latent", ylabel="z")
-    weights = inside.mixture.logpi[0, moment].exp().numpy().T
-    axes["weights"].imshow(weights, aspect="auto", cmap="cividis", vmin=0, vmax=1, interpolation="nearest")
-    axes["weights"].set(xlabel="latent", ylabel="Gaussian", yticks=[])
-    axes["weights"].set_title("M's mixture weights for the next z (yellow: 1)", fontsize=9)
-    names, values = ["steering", "gas", "brake"], drive.actions[moment]
-    axes["action"].barh(names, values, color=[ORANGE, GREEN, RED])
-    axes["action"].set(xlim=(-1, 1))
-    axes["action"].invert_yaxis()
-    axes["action"].axvline(0, color="black", lw=0.8)
-    axes["reward"].plot(drive.rewards.cumsum(), color=GREEN)
-    axes["reward"].axvline(moment, color="black", lw=1)
-    axes["reward"].set(xlabel="frame", ylabel="return so far", xlim=(0, len(drive) - 1))
+    latents.set(ylim=(-reach, reach), xlabel="latent", ylabel="z")
+    shares = inside.mixture.logpi[0, moment].exp().numpy().T
+    weights.imshow(shares, aspect="auto", cmap="cividis", vmin=0, vmax=1, interpolation="nearest")
+    weights.set(xlabel="latent", ylabel="Gaussian", yticks=[])
+    weights.set_title("M's mixture weights for the next z (yellow: 1)", fontsize=9)
+    action.barh(["steering", "gas", "brake"], drive.actions[moment], color=[ORANGE, GREEN, RED])
+    action.set(xlim=(-1, 1))
+    action.invert_yaxis()
+    action.axvline(0, color="black", lw=0.8)
+    reward = below.subplots()
+    reward.plot(drive.rewards.cumsum(), color=GREEN)
+    reward.axvline(moment, color="black", lw=1)
+    reward.set(xlabel="frame", ylabel="return so far", xlim=(0, len(drive) - 1))
     speed = drive.motion[moment, 0]
     title = (
         f"Frame {moment} of {len(drive)}: speed {speed:.0f} world units per second, reward {drive.rewards[moment]:+.1f}"

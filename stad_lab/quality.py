@@ -71,10 +71,10 @@ def autoencoder_quality(autoencoder: AutoEncoder, frames: np.ndarray, earlier: n
 
     Returns:
         A dict for JSON. "frame_error" and "difference_error" (None if not redrawn) are squared errors summed over a
-        picture, as in the loss; "blank_difference_error" is what an empty difference image would have. "regions" has
-        for each of REGIONS its "share" of the pixels, its "error" (squared, of one pixel, summed over the colours), and
-        what the best single colour for that region would have, "flat_error". "kl" is in nats, "kl_of_latents" of each,
-        "active" counts those above ACTIVE.
+        picture, as in the loss, of what is drawn from the mean of z; "blank_difference_error" is that of an empty
+        difference image. "regions" has for each of REGIONS its "share" of the pixels, its "error" (squared, of one
+        pixel, summed over the colours), and "flat_error", that of the best single colour, put there by an oracle that
+        knows the region. "kl" is in nats, "kl_of_latents" of each, "active" counts those above ACTIVE.
     """
     redrawn = redraw(autoencoder, frames, earlier)
     true = frames / np.float32(255)
@@ -100,6 +100,11 @@ def autoencoder_quality(autoencoder: AutoEncoder, frames: np.ndarray, earlier: n
 def gaussian_nll(error: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Negative log-likelihood in nats of errors under N(0, sigma^2), entry by entry."""
     return 0.5 * (error / sigma) ** 2 + np.log(sigma) + 0.5 * math.log(2 * math.pi)
+
+
+def constant_forecast(training: np.ndarray, latents: np.ndarray) -> np.ndarray:
+    """NLL of "the next z is as always": a Gaussian with mean and width of all training z; as `repeat_forecast`."""
+    return gaussian_nll(latents[:, 1:] - training.mean(axis=(0, 1)), training.std(axis=(0, 1)))
 
 
 def repeat_forecast(training: np.ndarray, latents: np.ndarray) -> np.ndarray:
@@ -166,14 +171,21 @@ def pit(mixture: Mixture, latents: np.ndarray) -> np.ndarray:
 
 @torch.no_grad()
 def dream_with(
-    mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray, awake: int, dreams: int = 16, seed: int = 0
+    mdn_rnn: MDNRNN,
+    latents: np.ndarray,
+    actions: np.ndarray,
+    awake: int,
+    dreams: int = 16,
+    temperature: float = 1.0,
+    seed: int = 0,
 ) -> np.ndarray:
     """Let M dream on with the actions that were really driven: open loop.
 
     Args:
         latents: z of drives, float32 (drives, T, latent_size); M is shown the first `awake` of them.
         actions: float32 (drives, T, 3).
-        dreams: of every drive, at temperature 1.
+        dreams: of every drive.
+        temperature: as for `sample_mixture`.
 
     Returns:
         The dreamed z of frames awake, awake + 1, ..., T - 1: float32 (dreams, drives, T - awake, latent_size).
@@ -181,30 +193,41 @@ def dream_with(
     generator = torch.Generator().manual_seed(seed)
     z, a = (torch.from_numpy(np.tile(part, (dreams, 1, 1))) for part in (latents, actions))
     mixture, state = mdn_rnn(z[:, :awake], a[:, :awake])
-    dreamed = [sample_mixture(Mixture(*(part[:, -1:] for part in mixture)), 1.0, generator)]
+    dreamed = [sample_mixture(Mixture(*(part[:, -1:] for part in mixture)), temperature, generator)]
     for step in range(awake, latents.shape[1] - 1):
         mixture, state = mdn_rnn(dreamed[-1], a[:, step : step + 1], state)
-        dreamed.append(sample_mixture(mixture, 1.0, generator))
+        dreamed.append(sample_mixture(mixture, temperature, generator))
     return torch.cat(dreamed, dim=1).numpy().reshape(dreams, len(latents), -1, latents.shape[2])
 
 
-def horizon_errors(dreamed: np.ndarray, mu: np.ndarray, awake: int) -> dict[str, np.ndarray]:
-    """How far dreams are from what came, against the number of steps dreamed.
+def horizon_errors(
+    autoencoder: AutoEncoder, dreamed: np.ndarray, mu: np.ndarray, awake: int, steps: list[int]
+) -> dict[str, list[float]]:
+    """How far dreams are from what came, against the number of steps dreamed, in what V draws of both.
+
+    Pictures are compared, not latents: a latent that tells nothing is noise, in the dream as well as in V.
 
     Args:
         dreamed: float32 (dreams, drives, steps, latent_size), from `dream_with`.
-        mu: V's means of the real frames, float32 (drives, awake + steps, latent_size).
+        mu: V's means of the real frames, float32 (drives, T, latent_size).
+        steps: at which to compare, 1 for the first dreamed frame.
 
     Returns:
-        Name -> root of the mean squared error over drives and latents for 1, 2, ... steps, as a share of that of the
-        best constant: "one dream", "mean of the dreams", "the last frame seen".
+        Name -> root of the mean squared error at these steps, as a share of that of the best constant picture for the
+        step, which is the average of what came: "one dream", "mean of the dreams", "the last frame seen".
     """
-    real = mu[:, awake:]
-    scale = np.sqrt(((real - mu.mean(axis=(0, 1))) ** 2).mean())
-    forecasts = {
-        "one dream": dreamed,
-        "mean of the dreams": dreamed.mean(axis=0),
-        "the last frame seen": mu[:, [awake - 1]],
-    }
-    axes = {name: tuple(axis for axis in range(made.ndim) if axis != made.ndim - 2) for name, made in forecasts.items()}
-    return {name: np.sqrt(((made - real) ** 2).mean(axis=axes[name])) / scale for name, made in forecasts.items()}
+    last = draw(autoencoder, mu[:, awake - 1])
+    errors = {"one dream": [], "mean of the dreams": [], "the last frame seen": []}
+    for step in steps:
+        came = draw(autoencoder, mu[:, awake + step - 1])
+        scale = np.sqrt(came.var(axis=0).mean())
+        dreams = np.stack([draw(autoencoder, dream[:, step - 1]) for dream in dreamed])
+        for name, drawn in zip(errors, (dreams, dreams.mean(axis=0), last), strict=True):
+            errors[name].append(float(np.sqrt(((drawn - came) ** 2).mean()) / scale))
+    return errors
+
+
+@torch.no_grad()
+def draw(autoencoder: AutoEncoder, z: np.ndarray) -> np.ndarray:
+    """The frames that V draws from z (n, latent_size): float32 (n, 64, 64, 3) in [0, 1]."""
+    return to_array(autoencoder.decode(torch.from_numpy(z))[0])

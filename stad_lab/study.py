@@ -18,7 +18,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import load_agent, load_world_model, run_folder
-from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, kl_divergence, load_autoencoder
 from stad_lab.drives import (
     MOTION,
     Drive,
@@ -34,7 +34,9 @@ from stad_lab.parallel import worker_processes
 from stad_lab.pipeline import provenance, train
 from stad_lab.probe import probe
 from stad_lab.quality import (
+    ACTIVE,
     autoencoder_quality,
+    constant_forecast,
     dream_with,
     forecast,
     horizon_errors,
@@ -52,11 +54,15 @@ SHORTER = 0.3  # the V's of the comparisons are trained for this share of the st
 CONTENDERS = {  # lesser M's: what is changed, and whether they see the actions
     "one Gaussian": ({"mixtures": 1}, True),
     "no actions": ({}, False),
-    "no memory": ({"m_sequence": 1, "m_batch": 3200}, True),
+    "no memory": ({"m_sequence": 1, "m_batch": 6400}, True),
 }
-DRIVE_FRAMES, AGENT_FRAMES = 150, 300  # of a drive of the random driver, and of the agent
+DRIVE_FRAMES, AGENT_FRAMES = 150, 360  # of a drive of the random driver, and of the agent
+# Frames of a drive that are not probed: without a difference image, or with the opening zoom, which tells the speed.
+RANDOM_SKIP, AGENT_SKIP = max(STRIDES), 60
 RECORD = Path(__file__).parent / "records" / "study.json"  # the study that we report
-AWAKE, ASLEEP = 30, 100  # frames that M sees before a dream, and frames that it dreams
+AWAKE = 30  # frames that M sees before a dream
+HORIZON = [1, 2, 3, 5, 7, 10, 14, 20, 30, 40, 50, 60, 70, 80, 90, 100]  # dreamed steps at which it is judged
+DREAMERS = 60  # drives in which M falls asleep
 
 
 def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str]) -> dict:
@@ -87,8 +93,8 @@ def check_parts(parts: list[str]) -> None:
 
 
 def random_drives(count: int, processes: int) -> list[Drive]:
-    """Drives of the random driver on tracks kept for inspection."""
-    settings = Settings.preset("laptop", seed=1, episodes=count, episode_frames=DRIVE_FRAMES)
+    """Drives of the random driver, each from a random tile of a track kept for inspection."""
+    settings = Settings.preset("laptop", seed=1, episodes=count, episode_frames=DRIVE_FRAMES, random_starts=1.0)
     with worker_processes(processes) as executor:
         drives = executor.map(functools.partial(record_random_drive, settings), range(count))
         return list(tqdm(drives, "random drives", count, unit="drive"))
@@ -108,39 +114,51 @@ def begin_agent_drive(track: int) -> Drive:
 
 def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
     """Probe the latents of every variant, and of every stride, for the true motion, under two drivers."""
-    drivers = {"random driver": drives, "trained agent": agent_drives(max(12, len(drives) // 3), settings.processes)}
+    by_agent = agent_drives(max(12, len(drives) // 3), settings.processes)
+    drivers = {"random driver": (drives, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
     torch.manual_seed(settings.seed)
     untrained = {
         f"{name}, untrained": AutoEncoder(name, settings.latent_size, settings.width)
         for name in ("frame", "input_output")
     }
+    untrained_mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).requires_grad_(False)
     strides = {str(stride): shorter_autoencoder(settings, rollouts_folder, work, stride=stride) for stride in STRIDES}
     result = {"variants": {}, "strides": {}}
-    for driver, driven in drivers.items():
+    for driver, (driven, skip) in drivers.items():
         found = result["variants"][driver] = {}
         for variant in VARIANTS:
             autoencoder, mdn_rnn, stride, crop_bar = load_world_model(run_folder(variant), variant)
-            found[variant] = probe_drives(driven, autoencoder, mdn_rnn, stride, crop_bar)
+            memories = {"z, h": mdn_rnn, "z, h of an untrained M": untrained_mdn_rnn}
+            found[variant] = probe_drives(driven, skip, autoencoder, memories, stride, crop_bar)
         for name, autoencoder in untrained.items():
-            found[name] = probe_drives(driven, autoencoder, None, settings.stride, settings.crop_bar)
+            found[name] = probe_drives(driven, skip, autoencoder, {}, settings.stride, settings.crop_bar)
         found = result["strides"][driver] = {}
         for stride, autoencoder in strides.items():
-            found[stride] = probe_drives(driven, autoencoder, None, int(stride), settings.crop_bar)
+            found[stride] = probe_drives(driven, skip, autoencoder, {}, int(stride), settings.crop_bar)
     return result
 
 
 def probe_drives(
-    drives: list[Drive], autoencoder: AutoEncoder, mdn_rnn: MDNRNN | None, stride: int, crop_bar: bool
+    drives: list[Drive], skip: int, autoencoder: AutoEncoder, memories: dict[str, MDNRNN], stride: int, crop_bar: bool
 ) -> dict:
-    """Probe z, and with M also z with h: {"z": {quantity: {"r2", "interval"}}, "z, h": ...}."""
+    """Probe the mean of z, which C is given, and z with what M's remember.
+
+    Only frames count in which the road is in sight, after the first `skip` frames of each drive.
+
+    Args:
+        memories: name -> M.
+
+    Returns:
+        {"z": {quantity: {"r2": number, "interval": [low, high]}}}, and the same for every name in `memories`.
+    """
     latents = [encode_drive(autoencoder, drive, stride, crop_bar)[0] for drive in drives]
     features = {"z": np.concatenate(latents)}
-    if mdn_rnn is not None:
+    for name, mdn_rnn in memories.items():
         hidden = [remember_drive(mdn_rnn, z, drive.actions)[0] for z, drive in zip(latents, drives, strict=True)]
-        features["z, h"] = np.concatenate([features["z"], np.concatenate(hidden)], axis=1)
+        features[name] = np.concatenate([features["z"], np.concatenate(hidden)], axis=1)
     motion = np.concatenate([drive.motion for drive in drives])
     number = np.repeat(np.arange(len(drives)), [len(drive) for drive in drives])
-    kept = road_in_sight(motion)
+    kept = road_in_sight(motion) & (np.concatenate([np.arange(len(drive)) for drive in drives]) >= skip)
     result = {}
     for name, seen in features.items():
         found = probe(seen[kept], motion[kept], number[kept])
@@ -162,13 +180,14 @@ def probe_panels(found: dict) -> dict:
     }
 
 
-def shorter_autoencoder(settings: Settings, rollouts_folder: Path, work: Path, **changes) -> AutoEncoder:
-    """V of the variant `input_output`, trained with `changes` for a share of the steps; loaded if it is there."""
-    settings = dataclasses.replace(settings, v_steps=round(SHORTER * settings.v_steps), **changes)
-    if changes == {"kl_weight": Settings.preset(settings.name).kl_weight}:
-        changes = {"stride": settings.stride}  # the run without a change is the same run for both comparisons
-    folder = work / "_".join(f"{name}_{value:g}" for name, value in changes.items())
-    train("input_output", settings, folder, rollouts_folder, until="autoencoder")
+def shorter_autoencoder(settings: Settings, rollouts_folder: Path, work: Path, **change) -> AutoEncoder:
+    """V of the variant `input_output`, trained with one change for a share of the steps; loaded if it is there."""
+    ((name, value),) = change.items()
+    if value == getattr(settings, name):  # no change: one training serves all comparisons
+        name, value = "stride", settings.stride
+    recipe = dataclasses.replace(settings, v_steps=round(SHORTER * settings.v_steps), **change)
+    folder = work / f"{name}_{value:g}"
+    train("input_output", recipe, folder, rollouts_folder, until="autoencoder")
     return load_autoencoder(folder / "autoencoder.safetensors", "input_output")[0]
 
 
@@ -195,7 +214,7 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
     """Measure M of every variant; for `input` also the lesser M's."""
     whole = [drive for drive in drives if len(drive) == DRIVE_FRAMES]
     actions = np.array([drive.actions for drive in whole])
-    result = {"drives": len(whole), "variants": {}}
+    result = {"drives": len(whole), "horizon_steps": HORIZON, "variants": {}}
     for variant in VARIANTS:
         autoencoder, mdn_rnn, stride, crop_bar = load_world_model(run_folder(variant), variant)
         mu, logvar = (
@@ -203,27 +222,59 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
             for part in zip(*(encode_drive(autoencoder, drive, stride, crop_bar) for drive in whole), strict=True)
         )
         z = mu + np.exp(0.5 * logvar) * np.random.default_rng(0).standard_normal(mu.shape, np.float32)
+        active = kl_divergence(torch.from_numpy(mu), torch.from_numpy(logvar)).mean(dim=(0, 1)).numpy() > ACTIVE
         mixture = forecast(mdn_rnn, z, actions)
-        counts, _ = np.histogram(pit(mixture, z), bins=20, range=(0, 1))
-        dreamed = dream_with(mdn_rnn, mu, actions, AWAKE)[:, :, :ASLEEP]
-        errors = horizon_errors(dreamed, mu[:, : AWAKE + ASLEEP], AWAKE)
+        counts, _ = np.histogram(pit(mixture, z)[..., active], bins=20, range=(0, 1))
+        dreamed = dream_with(mdn_rnn, mu[:DREAMERS], actions[:DREAMERS], AWAKE)
         result["variants"][variant] = {
+            "active": int(active.sum()),
             "nll": {"M": mixture_nll(mixture, z), **simple_forecasts(z, actions)},
             "pit": (counts / counts.sum()).tolist(),
-            "horizon": {name: error.tolist() for name, error in errors.items()},
+            "horizon": horizon_errors(autoencoder, dreamed, mu[:DREAMERS], AWAKE, HORIZON),
         }
         if variant == "input":
             lesser = lesser_forecasts(settings, rollouts_folder, work, autoencoder, z, actions)
             result["variants"][variant]["nll"] |= lesser
-    for found in result["variants"].values():
-        found["nll"] = {name: over_drives(nll[len(nll) // 2 :]) for name, nll in found["nll"].items()}
+        result["variants"][variant]["nll"] = compare(result["variants"][variant]["nll"], active)
     return result
+
+
+def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
+    """Forecasts beside M, on the second half of the drives: the first half is what simple ones were fitted on.
+
+    All are judged on the same frames, those that the longest forecast has, and on active latents only: the others are
+    noise that V adds, which no forecast can foresee.
+
+    Args:
+        nll: name -> nats (drives, frames, latent_size), the last frames of each drive; "M" among them.
+        active: bool (latent_size,).
+
+    Returns:
+        Name -> {"nats": mean, "interval": of it, "more_than_M": interval of the difference}, by bootstrap over drives.
+    """
+    frames = min(found.shape[1] for found in nll.values())
+    means = {name: found[len(found) // 2 :, -frames:, active].mean(axis=(1, 2)) for name, found in nll.items()}
+    return {
+        name: {
+            "nats": float(found.mean()),
+            "interval": bootstrap_interval(found),
+            "more_than_M": bootstrap_interval(found - means["M"]),
+        }
+        for name, found in means.items()
+    }
+
+
+def bootstrap_interval(values: np.ndarray) -> list[float]:
+    """95% interval of the mean of `values` (drives,)."""
+    again = np.random.default_rng(0).choice(values, (1000, len(values))).mean(axis=1)
+    return [float(bound) for bound in np.percentile(again, [2.5, 97.5])]
 
 
 def simple_forecasts(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
     """NLL of forecasts without a network, fitted on the first half of the drives, for all of them."""
     half = len(z) // 2
     return {
+        "always the same": constant_forecast(z[:half], z),
         "repeat the last z": repeat_forecast(z[:half], z),
         "linear, last z": linear_forecast(z[:half], actions[:half], z, actions, order=1),
         "linear, last 4 z": linear_forecast(z[:half], actions[:half], z, actions, order=4),
@@ -256,14 +307,6 @@ def lesser_forecasts(
             nll = mixture_nll(forecast(mdn_rnn, pairs, moments), pairs)
             result[name] = nll.reshape(len(z), -1, z.shape[2])
     return result
-
-
-def over_drives(nll: np.ndarray) -> dict:
-    """Mean of (drives, frames, latents) over everything, with a bootstrap interval over drives; the first 3 frames of
-    the longest forecasts are left out, so that all are judged on the same frames."""
-    means = nll[:, -(DRIVE_FRAMES - 4) :].mean(axis=(1, 2))
-    again = np.random.default_rng(0).choice(means, (1000, len(means))).mean(axis=1)
-    return {"nats": float(means.mean()), "interval": [float(bound) for bound in np.percentile(again, [2.5, 97.5])]}
 
 
 PARTS = {"probe": probe_part, "autoencoder": autoencoder_part, "mdn_rnn": mdn_rnn_part}

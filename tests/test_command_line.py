@@ -102,7 +102,8 @@ def test_the_second_run_of_a_command_does_nothing_and_says_so(run, command_line)
         ("evaluate", ["--variant", "--path", "--episodes", "--first-track", "--fast", "--processes", "--json"]),
         ("benchmark", ["--part", "--rounds", "--json", "parity", "renderer", "loop", "training"]),
         ("ship", ["--variant", "--path"]),
-        ("film", ["--variant", "--path", "--out", "--track", "--first", "--frames"]),
+        ("film", ["--variant", "--path", "--out", "--track", "--first", "--frames", "--viewer"]),
+        ("study", ["--settings", "--out", "--rollouts", "--part", "probe", "autoencoder", "mdn_rnn"]),
     ],
 )
 def test_help_names_every_option(command, options, capsys):
@@ -123,7 +124,7 @@ def test_help_names_every_setting(capsys):
 def test_the_first_help_names_every_command(command_line):
     process = command_line("--help")
     assert process.returncode == 0
-    for command in ("train", "evaluate", "benchmark", "ship", "film"):
+    for command in ("train", "evaluate", "study", "benchmark", "ship", "film"):
         assert command in process.stdout
 
 
@@ -138,13 +139,14 @@ def test_until_stops_after_a_stage_and_set_changes_a_setting(tmp_path, capsys):
     assert Settings.from_dict(settings) == Settings.preset("quick", **changes)
 
 
-def test_a_film_is_a_moving_picture(quick_run, tmp_path, capsys):
-    file = tmp_path / "drive.gif"
+@pytest.mark.parametrize(("name", "options"), [("drive.gif", []), ("drive.webp", ["--viewer"])])
+def test_a_film_is_a_moving_picture(name, options, quick_run, tmp_path, capsys):
+    file = tmp_path / name
     arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", file, "--first", 20, "--frames", 12]
-    assert main([str(argument) for argument in arguments]) == 0
+    assert main([str(argument) for argument in (*arguments, *options)]) == 0
     assert f"filmed to {file}" in capsys.readouterr().out
     with Image.open(file) as film:
-        assert film.format == "GIF"
+        assert film.format.lower() == file.suffix[1:]
         pictures = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
     assert len(pictures) == 4  # every third frame
     assert not np.array_equal(pictures[0], pictures[-1])

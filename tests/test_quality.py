@@ -12,6 +12,7 @@ from stad_lab.frames import earlier_frames
 from stad_lab.mdn_rnn import MDNRNN, Mixture, mdn_loss, sample_mixture
 from stad_lab.quality import (
     autoencoder_quality,
+    constant_forecast,
     dream_with,
     forecast,
     gaussian_nll,
@@ -89,6 +90,7 @@ def test_a_random_walk_is_best_repeated_and_a_linear_law_is_found():
     steps, actions = latents_and_actions(drives=200)
     walk = 0.1 * steps.cumsum(axis=1)
     entropy = 0.5 * math.log(2 * math.pi * math.e * 0.01)  # of a step: no forecast can do better
+    assert constant_forecast(steps[:100], steps[100:]).mean() == pytest.approx(entropy + math.log(10), abs=0.03)
     assert repeat_forecast(walk[:100], walk[100:]).mean() == pytest.approx(entropy, abs=0.03)
     assert linear_forecast(walk[:100], actions[:100], walk[100:], actions[100:], 1).mean() == pytest.approx(
         entropy, abs=0.03
@@ -134,11 +136,16 @@ def test_dreams_begin_where_the_car_fell_asleep_and_repeat_for_a_seed():
     assert np.abs(many - mean).max() < 0.15
 
 
-def test_horizon_errors_are_zero_for_the_truth_and_one_for_the_best_constant():
-    mu, _ = latents_and_actions(drives=400)
-    real = mu[:, 8:]
-    assert not horizon_errors(real[None], mu, awake=8)["one dream"].any()
-    constant = np.broadcast_to(mu.mean(axis=(0, 1)), (3, *real.shape))
-    errors = horizon_errors(constant, mu, awake=8)
-    assert np.allclose(errors["one dream"], 1, atol=0.1) and np.allclose(errors["mean of the dreams"], 1, atol=0.1)
-    assert np.allclose(errors["the last frame seen"], math.sqrt(2), atol=0.15)  # two independent draws
+def test_horizon_errors_are_zero_for_the_truth_and_grow_with_what_is_dreamed_wrong():
+    torch.manual_seed(0)
+    autoencoder, (mu, _) = AutoEncoder("frame", latent_size=4, width=4), latents_and_actions(drives=40)
+    real = np.repeat(mu[None, :, 8:], 3, axis=0)
+    errors = horizon_errors(autoencoder, real, mu, awake=8, steps=[1, 5, 12])
+    assert np.allclose(errors["one dream"], 0, atol=1e-3) and np.allclose(errors["mean of the dreams"], 0, atol=1e-3)
+    assert np.allclose(errors["the last frame seen"], np.sqrt(2), atol=0.25)  # two independent draws
+    wrong = (
+        real + 0.5 * np.arange(12, dtype=np.float32)[:, None] * np.array([1, -1, 1], np.float32)[:, None, None, None]
+    )
+    errors = horizon_errors(autoencoder, wrong, mu, awake=8, steps=[1, 5, 12])
+    assert errors["one dream"][0] < 1e-3 < errors["one dream"][1] < errors["one dream"][2]
+    assert errors["mean of the dreams"][2] < errors["one dream"][2]

@@ -10,13 +10,7 @@ from stad_lab.autoencoder import VARIANTS, AutoEncoder
 from stad_lab.checkpoints import load_json
 from stad_lab.drives import MOTION, record_random_drive
 from stad_lab.settings import Settings
-from stad_lab.study import (
-    CONTENDERS,
-    over_drives,
-    probe_drives,
-    probe_panels,
-    study,
-)
+from stad_lab.study import CONTENDERS, HORIZON, compare, probe_drives, probe_panels, study
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +30,7 @@ def test_the_command_measures_m_against_simple_forecasts_and_lesser_m_s(measured
     assert set(CONTENDERS) < set(nll) and all(v["interval"][0] <= v["nats"] <= v["interval"][1] for v in nll.values())
     assert nll["M"]["nats"] < nll["repeat the last z"]["nats"]
     for found in result["mdn_rnn"]["variants"].values():
-        assert sum(found["pit"]) == pytest.approx(1) and len(found["horizon"]["one dream"]) == 100
+        assert sum(found["pit"]) == pytest.approx(1) and len(found["horizon"]["one dream"]) == len(HORIZON)
 
 
 def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, command_line):
@@ -59,13 +53,17 @@ def test_an_unknown_part_is_refused_before_any_work(tmp_path):
 def test_drives_are_probed_for_every_motion_and_shown_by_motion():
     settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
     drives = [record_random_drive(settings, index) for index in range(12)]
-    found = probe_drives(drives, AutoEncoder("input_output", width=4), None, settings.stride, settings.crop_bar)
+    found = probe_drives(drives, 8, AutoEncoder("input_output", width=4), {}, settings.stride, settings.crop_bar)
     assert list(found) == ["z"] and set(found["z"]) == set(MOTION)
     panels = probe_panels({"untrained": found})
     assert panels["yaw rate"]["untrained"]["z"][0] == found["z"]["yaw rate"]["r2"]
 
 
-def test_all_forecasts_are_judged_on_the_same_frames():
-    nll = np.zeros((5, 149, 2))
+def test_forecasts_are_compared_on_the_same_frames_and_on_active_latents():
+    nll = np.ones((6, 149, 3))
     nll[:, :3] = 100  # frames that a forecast from the last four z's cannot have
-    assert over_drives(nll)["nats"] == over_drives(nll[:, 3:])["nats"] == 0
+    nll[..., 2] = 50  # a latent that tells nothing
+    nll[:3] = -7  # drives that the simple forecasts were fitted on
+    found = compare({"M": nll, "longer": nll[:, 3:] + 0.5}, np.array([True, True, False]))
+    assert found["M"]["nats"] == 1 and found["longer"]["nats"] == 1.5
+    assert found["longer"]["more_than_M"] == [0.5, 0.5] and found["M"]["more_than_M"] == [0, 0]
