@@ -10,7 +10,7 @@ from pathlib import Path
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.benchmark import PARTS, benchmark
-from stad_lab.checkpoints import save_json, write_bytes
+from stad_lab.checkpoints import load_json, save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
 from stad_lab.film import film_agent, film_viewer
 from stad_lab.pipeline import STAGES, ship, train
@@ -153,9 +153,10 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"  every episode: {file}")
         elif options.command == "study":
             settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
-            parts = options.part or list(STUDY_PARTS)
-            save_json(options.out / "study.json", study(settings, rollouts, options.out, parts))
-            print(f"every measurement: {options.out / 'study.json'}")
+            file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)
+            before = load_json(file) if file.exists() else {}
+            save_json(file, before | study(settings, rollouts, options.out, parts))
+            print(f"every measurement: {file}")
         elif options.command == "benchmark":
             save_json(options.json, benchmark(options.part or list(PARTS), options.rounds))
             print(f"\nevery measurement: {options.json}")

@@ -20,13 +20,13 @@ REGIONS = ("road", "grass", "car")
 
 
 def region_masks(frames: np.ndarray) -> dict[str, np.ndarray]:
-    """Which pixels are road (with kerbs), grass, and car: bool (n, 64, 64) for each of REGIONS.
+    """Which pixels are road (with kerbs), grass (with the black beyond the field) and car: bool (n, 64, 64) for each.
 
     Args:
         frames: uint8 (n, 64, 64, 3), with the indicator bar cropped.
     """
-    red, green = frames[..., 0].astype(int), frames[..., 1].astype(int)
-    grass = green - red > 30
+    red, green = frames[..., 0].astype(np.int16), frames[..., 1].astype(np.int16)
+    grass = (green - red > 30) | (green < 20) & (red < 20)
     car = np.zeros_like(grass)
     car[:, *CAR] = True
     return {"road": ~grass & ~car, "grass": grass & ~car, "car": car}
@@ -82,7 +82,7 @@ def autoencoder_quality(autoencoder: AutoEncoder, frames: np.ndarray, earlier: n
     difference = true - earlier / np.float32(255)
     regions = {}
     for name, mask in region_masks(frames).items():
-        flat = ((true[mask] - true[mask].mean(axis=0)) ** 2).sum(axis=-1).mean()
+        flat = ((true[mask] - true[mask].mean(axis=0, dtype=np.float64)) ** 2).sum(axis=-1).mean()
         regions[name] = {"share": mask.mean(), "error": error[mask].mean(), "flat_error": flat}
     drawn = redrawn.differences
     result = {

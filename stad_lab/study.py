@@ -75,14 +75,17 @@ def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str
         parts: some of PARTS.
 
     Returns:
-        A dict for JSON, one entry for each part, and "made_with".
+        A dict for JSON: for each part what it found, its "settings", and what it was "made_with".
     """
     check_parts(parts)
     collect_rollouts(settings, rollouts_folder)
     drives = random_drives(max(12, settings.episodes // 5), settings.processes)
-    run = {name: PARTS[name](settings, Path(rollouts_folder), Path(work), drives) for name in parts}
-    command = f"python -m stad_lab study --settings {settings.name}"
-    return {"settings": settings.as_dict(), "drives": len(drives), **run, "made_with": provenance(command)}
+    result = {}
+    for name in parts:
+        found = PARTS[name](settings, Path(rollouts_folder), Path(work), drives)
+        made_with = provenance(f"python -m stad_lab study --settings {settings.name} --part {name} --out ...")
+        result[name] = {**found, "drives": len(drives), "settings": settings.as_dict(), "made_with": made_with}
+    return result
 
 
 def check_parts(parts: list[str]) -> None:
@@ -214,7 +217,7 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
     """Measure M of every variant; for `input` also the lesser M's."""
     whole = [drive for drive in drives if len(drive) == DRIVE_FRAMES]
     actions = np.array([drive.actions for drive in whole])
-    result = {"drives": len(whole), "horizon_steps": HORIZON, "variants": {}}
+    result = {"whole_drives": len(whole), "horizon_steps": HORIZON, "variants": {}}
     for variant in VARIANTS:
         autoencoder, mdn_rnn, stride, crop_bar = load_world_model(run_folder(variant), variant)
         mu, logvar = (
