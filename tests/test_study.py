@@ -10,7 +10,18 @@ from stad_lab.autoencoder import VARIANTS, AutoEncoder
 from stad_lab.checkpoints import load_json
 from stad_lab.drives import MOTION, record_random_drive
 from stad_lab.settings import Settings
-from stad_lab.study import CONTENDERS, HORIZON, compare, probe_drives, probe_panels, study
+from stad_lab.study import (
+    CONTENDERS,
+    HORIZON,
+    KL_WEIGHTS,
+    PARTS,
+    RECORD,
+    STRIDES,
+    compare,
+    probe_drives,
+    probe_panels,
+    study,
+)
 
 
 @pytest.fixture(scope="module")
@@ -67,3 +78,17 @@ def test_forecasts_are_compared_on_the_same_frames_and_on_active_latents():
     found = compare({"M": nll, "longer": nll[:, 3:] + 0.5}, np.array([True, True, False]))
     assert found["M"]["nats"] == 1 and found["longer"]["nats"] == 1.5
     assert found["longer"]["more_than_M"] == [0.5, 0.5] and found["M"]["more_than_M"] == [0, 0]
+
+
+def test_the_shipped_record_is_a_whole_study_of_what_is_shipped():
+    record = load_json(RECORD)
+    assert set(record) == set(PARTS)
+    for part in record.values():
+        assert part["settings"]["name"] == "laptop" and part["drives"] == 180
+        assert part["made_with"]["commit"] and not part["made_with"]["uncommitted_changes"]
+    for driver in record["probe"]["variants"].values():
+        assert set(VARIANTS) < set(driver) and any("untrained" in source for source in driver)
+        assert all(list(driver[variant]) == ["z", "z, h", "z, h of an untrained M"] for variant in VARIANTS)
+    assert all(list(found) == [str(stride) for stride in STRIDES] for found in record["probe"]["strides"].values())
+    assert list(record["autoencoder"]["rate_distortion"]) == [f"{weight:g}" for weight in KL_WEIGHTS]
+    assert set(record["autoencoder"]["variants"]) == set(record["mdn_rnn"]["variants"]) == set(VARIANTS)
