@@ -151,12 +151,14 @@ def plot_curves(
         marker: matplotlib's name of a mark at each point.
         **axis_settings: of matplotlib's axis, for example `xscale="log"`.
     """
-    figure, ((axis,),) = new_figure(6.5, 3.2)
+    many = len(curves) > 4  # then the names stand beside the lines
+    figure, ((axis,),) = new_figure(7.5 if many else 6.5, 3.2)
     for (name, values), color in zip(curves.items(), COLORS, strict=False):
         places = np.arange(1, len(values) + 1) if x is None else x
         axis.plot(places, values, color=color, label=name, marker=marker)
     axis.set(xlabel=xlabel, ylabel=ylabel, **axis_settings)
-    axis.legend(frameon=False, fontsize=9)
+    beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5)} if many else {}
+    axis.legend(frameon=False, fontsize=9, **beside)
     axis.set_title(title, fontsize=11)
     figure.set_label(f"{title}. Lines: {', '.join(curves)}.")
     return figure

@@ -301,6 +301,7 @@ def lesser_forecasts(
             checkpoint = path.with_name("mdn_rnn.training.safetensors")
             history = fit_mdn_rnn(mdn_rnn, encoded, shown, first_heldout, lesser, checkpoint)
             save_mdn_rnn(path, mdn_rnn, "input", history)
+            checkpoint.unlink()
         mdn_rnn, _ = load_mdn_rnn(path, "input")
         if lesser.m_sequence > 1:
             result[name] = mixture_nll(forecast(mdn_rnn, z, actions * sees_actions), z)
