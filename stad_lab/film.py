@@ -8,7 +8,7 @@ from stad_lab.autoencoder import to_pictures
 from stad_lab.dream import to_uint8
 from stad_lab.drives import Drive, Inside, look_inside, record_drive
 from stad_lab.frames import earlier_frames
-from stad_lab.plots import difference_colors, moving_figure, moving_picture, plot_moment
+from stad_lab.plots import check_kind, difference_colors, moving_figure, moving_picture, plot_moment
 
 
 @torch.no_grad()
@@ -46,6 +46,7 @@ def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 
     Raises:
         ValueError: the episode ends before `first`, or another kind.
     """
+    check_kind(kind)
     drive = record_longer_drive(agent, track, first, frames)
     inside = look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
     return film_inside(drive, inside, first, every, kind)

@@ -442,14 +442,19 @@ def moving_figure(figures: Iterable[Figure], fps: float, kind: str = "gif") -> b
     Raises:
         ValueError: another kind, or no figures.
     """
-    if kind not in ("gif", "webp"):
-        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp'")
+    check_kind(kind)
     pages = [Image.open(io.BytesIO(to_png(figure))).convert("RGB") for figure in figures]
     if not pages:
         raise ValueError("no figures: expected at least one")
     buffer = io.BytesIO()
     pages[0].save(buffer, kind, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
     return buffer.getvalue()
+
+
+def check_kind(kind: str) -> None:
+    """Raise ValueError unless `kind` is one of those that `moving_figure` can write."""
+    if kind not in ("gif", "webp"):
+        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp', by the file's name too")
 
 
 def to_png(figure: Figure) -> bytes:

@@ -295,3 +295,10 @@ def test_a_wrong_number_ends_in_one_clear_line(options, run, capsys):
     error = the_error(capsys, [*evaluate_quickly(run), *options])
     assert f"{options[0].strip('-').replace('-', '_')}={options[1]}" in error
     assert "expected" in error
+
+
+def test_a_film_of_another_kind_is_refused_before_the_drive(quick_run, tmp_path, capsys):
+    arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", tmp_path / "drive.mp4", "--viewer"]
+    assert main([str(argument) for argument in arguments]) == 2
+    assert "error: kind='mp4': expected 'gif' or 'webp'" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
