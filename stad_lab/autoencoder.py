@@ -158,6 +158,11 @@ def to_pictures(
     return frame, frame - before
 
 
+def to_array(pictures: torch.Tensor) -> np.ndarray:
+    """Pictures (batch, 3, 64, 64) as an array (batch, 64, 64, 3)."""
+    return pictures.permute(0, 2, 3, 1).numpy()
+
+
 def autoencoder_losses(
     autoencoder: AutoEncoder, frame: torch.Tensor, difference: torch.Tensor, noise: torch.Tensor, settings: Settings
 ) -> dict[str, torch.Tensor]:

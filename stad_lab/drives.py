@@ -12,11 +12,11 @@ import numpy as np
 import torch
 
 from stad_lab.agent import Agent
-from stad_lab.autoencoder import AutoEncoder, to_pictures
+from stad_lab.autoencoder import AutoEncoder, to_array
 from stad_lab.car_racing import TRACK_WIDTH, make_env
 from stad_lab.dream import to_uint8
-from stad_lab.frames import earlier_frames, episode_differences, to_frame
-from stad_lab.mdn_rnn import MDNRNN, Mixture
+from stad_lab.frames import episode_differences, to_frame
+from stad_lab.mdn_rnn import MDNRNN, Mixture, encode_frames
 from stad_lab.rollouts import begin_randomly
 from stad_lab.settings import Settings
 
@@ -127,14 +127,11 @@ class Inside:
     """What M expects after the frame and the action: parts (1, T, latent_size, mixtures)."""
 
 
-@torch.no_grad()
 def encode_drive(
     autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
     """What V makes of a drive: mu and logvar of z, float32 (T, latent_size) each."""
-    frames = drive.frames(crop_bar)
-    mu, logvar = autoencoder.encode(*to_pictures(frames, earlier_frames(frames, stride)))
-    return mu.numpy(), logvar.numpy()
+    return tuple(encode_frames(autoencoder, drive.frames(crop_bar), stride))
 
 
 @torch.no_grad()
@@ -150,9 +147,8 @@ def remember_drive(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) ->
 def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool = True) -> Inside:
     """Show V and M a drive from its first frame on, and keep everything they make of it."""
     frames = drive.frames(crop_bar)
-    mu, logvar = encode_drive(autoencoder, drive, stride, crop_bar)
+    mu, logvar = encode_frames(autoencoder, frames, stride)
     hidden, mixture = remember_drive(mdn_rnn, mu, drive.actions)
     drawn, changed = autoencoder.decode(torch.from_numpy(mu))
-    if changed is not None:
-        changed = changed.permute(0, 2, 3, 1).numpy()
+    changed = None if changed is None else to_array(changed)
     return Inside(frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, logvar, hidden, mixture)

@@ -4,7 +4,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent
-from stad_lab.autoencoder import to_pictures
+from stad_lab.autoencoder import to_array, to_pictures
 from stad_lab.dream import to_uint8
 from stad_lab.drives import Drive, Inside, look_inside, record_drive
 from stad_lab.frames import earlier_frames
@@ -31,7 +31,7 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
     frame, difference = to_pictures(film[shown], earlier[shown])
     columns = {
         "what the car shows": drive.observations[shown],
-        "what changes": difference_colors(difference.permute(0, 2, 3, 1).numpy()),
+        "what changes": difference_colors(to_array(difference)),
         "what V makes of it": to_uint8(agent.autoencoder.reconstruct(frame, difference)[0]),
     }
     return moving_picture(columns, fps=50 / every)

@@ -125,17 +125,21 @@ def check_temperature(temperature: float) -> None:
 
 
 @torch.no_grad()
+def encode_frames(autoencoder: AutoEncoder, frames: np.ndarray, stride: int) -> np.ndarray:
+    """What V makes of an episode's frames, uint8 (T, 64, 64, 3): mu and logvar, float32 (2, T, latent_size)."""
+    device, count = next(autoencoder.parameters()).device, max(1, len(frames) // 250)
+    pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
+    parts = [torch.stack(autoencoder.encode(*to_pictures(*pair, device))) for pair in pairs]
+    return torch.cat(parts, dim=1).cpu().numpy()
+
+
 def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -> list[np.ndarray]:
     """What V makes of every episode: one float32 array (2, T, latent_size) each, mu and logvar."""
-    device = next(autoencoder.parameters()).device
     # One array, made before the work: a small one kept after each episode would chop up the memory that is freed.
     whole = np.empty((2, len(rollouts), autoencoder.latent_size), np.float32)
     encoded = np.split(whole, np.flatnonzero(np.diff(rollouts.episode)) + 1, axis=1)  # views on it
     for episode, frames in zip(encoded, tqdm(rollouts.frames, "encode", unit="episode"), strict=True):
-        count = max(1, len(frames) // 250)
-        pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
-        parts = [torch.stack(autoencoder.encode(*to_pictures(*pair, device))) for pair in pairs]
-        episode[:] = torch.cat(parts, dim=1).cpu().numpy()
+        episode[:] = encode_frames(autoencoder, frames, stride)
     return encoded
 
 
@@ -181,27 +185,24 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)
     encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
-    first_heldout = rollouts.episode[rollouts.split()[1][0]]
-    checkpoint = path.with_name("mdn_rnn.training.safetensors")
-    history = fit_mdn_rnn(mdn_rnn, encoded, rollouts.actions, first_heldout, settings, checkpoint)
-    save_mdn_rnn(path, mdn_rnn, variant, history)
-    checkpoint.unlink()
+    fit_mdn_rnn(path, mdn_rnn, variant, encoded, rollouts.actions, rollouts, settings)
     return True
 
 
 def fit_mdn_rnn(
+    path: Path,
     mdn_rnn: MDNRNN,
+    variant: str,
     encoded: list[np.ndarray],
     actions: list[np.ndarray],
-    first_heldout: int,
+    rollouts: Rollouts,
     settings: Settings,
-    checkpoint: Path,
-) -> list[dict]:
-    """Train M in place on encoded episodes (see `encode_rollouts`) and their actions; returns `fit`'s history.
+) -> None:
+    """Train M on encoded episodes (see `encode_rollouts`) and the actions that it is shown, and write it to `path`.
 
-    Training has a fixed length. Episodes from `first_heldout` on are held out.
+    Training has a fixed length; the rollouts say which episodes are held out. It resumes.
     """
-    device = next(mdn_rnn.parameters()).device
+    device, first_heldout = next(mdn_rnn.parameters()).device, rollouts.episode[rollouts.split()[1][0]]
 
     def draw(episodes: slice, batch: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
         return sequence_batch(encoded[episodes], actions[episodes], settings.m_sequence, batch, rng)
@@ -218,9 +219,12 @@ def fit_mdn_rnn(
     def heldout_losses() -> dict[str, float]:
         return {"total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))["total"].item()}
 
-    return fit(
+    checkpoint = path.with_name("mdn_rnn.training.safetensors")
+    history = fit(
         mdn_rnn, batch, losses, heldout_losses, settings.m_steps, settings.m_learning_rate, checkpoint, "train M"
     )
+    save_mdn_rnn(path, mdn_rnn, variant, history)
+    checkpoint.unlink()
 
 
 def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list) -> None:

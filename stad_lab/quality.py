@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from stad_lab.autoencoder import AutoEncoder, kl_divergence, to_pictures
+from stad_lab.autoencoder import AutoEncoder, kl_divergence, to_array, to_pictures
 from stad_lab.mdn_rnn import MDNRNN, Mixture, log_likelihood, sample_mixture
 
 ACTIVE = 0.05  # nats; a latent that tells less on average is called inactive
@@ -56,11 +56,6 @@ def redraw(autoencoder: AutoEncoder, frames: np.ndarray, earlier: np.ndarray) ->
     return Redrawn(
         np.concatenate(drawn), None if differences[0] is None else np.concatenate(differences), np.concatenate(kl)
     )
-
-
-def to_array(pictures: torch.Tensor) -> np.ndarray:
-    """Pictures (n, 3, 64, 64) as an array (n, 64, 64, 3)."""
-    return pictures.permute(0, 2, 3, 1).numpy()
 
 
 def autoencoder_quality(autoencoder: AutoEncoder, frames: np.ndarray, earlier: np.ndarray) -> dict:
@@ -153,6 +148,13 @@ def forecast(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> Mixtu
 def mixture_nll(mixture: Mixture, latents: np.ndarray) -> np.ndarray:
     """NLL of frames 1, 2, ..., T - 1 under M's forecast: nats, (drives, T - 1, latent_size)."""
     return -log_likelihood(mixture, torch.from_numpy(latents[:, 1:])).numpy()
+
+
+def single_step_nll(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """As `mixture_nll` of M's forecast, but with an empty memory before every frame: each two are a drive."""
+    pairs = np.stack([latents[:, :-1], latents[:, 1:]], axis=2).reshape(-1, 2, latents.shape[2])
+    pair_actions = np.repeat(actions[:, :-1].reshape(-1, 1, actions.shape[2]), 2, axis=1)
+    return mixture_nll(forecast(mdn_rnn, pairs, pair_actions), pairs).reshape(len(latents), -1, latents.shape[2])
 
 
 def pit(mixture: Mixture, latents: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ rollouts that those were trained on, and an interrupted study goes on where it s
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from stad_lab.drives import (
     road_in_sight,
 )
 from stad_lab.frames import earlier_frames
-from stad_lab.mdn_rnn import MDNRNN, encode_rollouts, fit_mdn_rnn, load_mdn_rnn, save_mdn_rnn
+from stad_lab.mdn_rnn import MDNRNN, encode_rollouts, fit_mdn_rnn, load_mdn_rnn
 from stad_lab.parallel import worker_processes
 from stad_lab.pipeline import provenance, train
 from stad_lab.probe import probe
@@ -44,6 +45,7 @@ from stad_lab.quality import (
     mixture_nll,
     pit,
     repeat_forecast,
+    single_step_nll,
 )
 from stad_lab.rollouts import Rollouts, collect_rollouts, track_seeds
 from stad_lab.settings import Settings
@@ -98,16 +100,18 @@ def check_parts(parts: list[str]) -> None:
 def random_drives(count: int, processes: int) -> list[Drive]:
     """Drives of the random driver, each from a random tile of a track kept for inspection."""
     settings = Settings.preset("laptop", seed=1, episodes=count, episode_frames=DRIVE_FRAMES, random_starts=1.0)
-    with worker_processes(processes) as executor:
-        drives = executor.map(functools.partial(record_random_drive, settings), range(count))
-        return list(tqdm(drives, "random drives", count, unit="drive"))
+    return record_all(functools.partial(record_random_drive, settings), list(range(count)), "random", processes)
 
 
 def agent_drives(count: int, processes: int) -> list[Drive]:
     """The beginnings of drives of the shipped `input` agent: the road at speed, which no random driver sees."""
+    return record_all(begin_agent_drive, track_seeds("inspect", count, 2), "agent", processes)
+
+
+def record_all(record: Callable[[int], Drive], numbers: list[int], label: str, processes: int) -> list[Drive]:
+    """`record` of every number, in worker processes."""
     with worker_processes(processes) as executor:
-        drives = executor.map(begin_agent_drive, track_seeds("inspect", count, 2))
-        return list(tqdm(drives, "agent drives", count, unit="drive"))
+        return list(tqdm(executor.map(record, numbers), f"{label} drives", len(numbers), unit="drive"))
 
 
 def begin_agent_drive(track: int) -> Drive:
@@ -229,16 +233,15 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
         mixture = forecast(mdn_rnn, z, actions)
         counts, _ = np.histogram(pit(mixture, z)[..., active], bins=20, range=(0, 1))
         dreamed = dream_with(mdn_rnn, mu[:DREAMERS], actions[:DREAMERS], AWAKE)
+        nll = {"M": mixture_nll(mixture, z), **simple_forecasts(z, actions)}
+        if variant == "input":
+            nll |= lesser_forecasts(settings, rollouts_folder, work, autoencoder, z, actions)
         result["variants"][variant] = {
             "active": int(active.sum()),
-            "nll": {"M": mixture_nll(mixture, z), **simple_forecasts(z, actions)},
+            "nll": compare(nll, active),
             "pit": (counts / counts.sum()).tolist(),
             "horizon": horizon_errors(autoencoder, dreamed, mu[:DREAMERS], AWAKE, HORIZON),
         }
-        if variant == "input":
-            lesser = lesser_forecasts(settings, rollouts_folder, work, autoencoder, z, actions)
-            result["variants"][variant]["nll"] |= lesser
-        result["variants"][variant]["nll"] = compare(result["variants"][variant]["nll"], active)
     return result
 
 
@@ -297,19 +300,12 @@ def lesser_forecasts(
             torch.manual_seed(settings.seed)
             mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures)
             shown = [action * sees_actions for action in rollouts.actions]
-            first_heldout = rollouts.episode[rollouts.split()[1][0]]
-            checkpoint = path.with_name("mdn_rnn.training.safetensors")
-            history = fit_mdn_rnn(mdn_rnn, encoded, shown, first_heldout, lesser, checkpoint)
-            save_mdn_rnn(path, mdn_rnn, "input", history)
-            checkpoint.unlink()
+            fit_mdn_rnn(path, mdn_rnn, "input", encoded, shown, rollouts, lesser)
         mdn_rnn, _ = load_mdn_rnn(path, "input")
         if lesser.m_sequence > 1:
             result[name] = mixture_nll(forecast(mdn_rnn, z, actions * sees_actions), z)
-        else:  # every pair of frames is a sequence of its own
-            pairs = np.stack([z[:, :-1], z[:, 1:]], axis=2).reshape(-1, 2, z.shape[2])
-            moments = np.repeat(actions[:, :-1].reshape(-1, 1, actions.shape[2]), 2, axis=1)
-            nll = mixture_nll(forecast(mdn_rnn, pairs, moments), pairs)
-            result[name] = nll.reshape(len(z), -1, z.shape[2])
+        else:
+            result[name] = single_step_nll(mdn_rnn, z, actions)
     return result
 
 

@@ -17,7 +17,7 @@ from pygments import highlight
 from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
-from stad_lab.autoencoder import AutoEncoder
+from stad_lab.autoencoder import AutoEncoder, to_array
 from stad_lab.dream import to_uint8
 from stad_lab.drives import Drive, Inside
 from stad_lab.plots import difference_colors, plot_moment, to_png
@@ -98,7 +98,9 @@ def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
     Args:
         z: where the sliders begin, float32 (latent_size,).
     """
-    pictures = [ipywidgets.Image(format="png", width=224, height=224) for _ in range(2)]
+    pictures = [
+        ipywidgets.Image(format="png", width=224, height=224) for _ in range(1 + autoencoder.redraws_difference)
+    ]
     sliders = [
         ipywidgets.FloatSlider(
             round(float(value), 2), min=-4, max=4, step=0.05, description=f"z[{number}]", readout_format=".1f"
@@ -107,16 +109,15 @@ def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
     ]
 
     def redraw(_change=None) -> None:
-        for picture, drawn in zip(pictures, draw_latents(autoencoder, [s.value for s in sliders]), strict=False):
+        for picture, drawn in zip(pictures, draw_latents(autoencoder, [s.value for s in sliders]), strict=True):
             picture.value = drawn
 
     for control in sliders:
         control.layout.width = "230px"
         control.observe(redraw, "value")
     redraw()
-    shown = pictures if autoencoder.redraws_difference else pictures[:1]
     grid = ipywidgets.GridBox(sliders, layout={"grid_template_columns": "repeat(4, 240px)"})
-    return ipywidgets.VBox([ipywidgets.HBox(shown), grid])
+    return ipywidgets.VBox([ipywidgets.HBox(pictures), grid])
 
 
 @torch.no_grad()
@@ -125,7 +126,7 @@ def draw_latents(autoencoder: AutoEncoder, z: list[float]) -> list[bytes]:
     frame, difference = autoencoder.decode(torch.tensor([z], dtype=torch.float32))
     pictures = [to_uint8(frame)[0]]
     if difference is not None:
-        pictures.append(difference_colors(difference[0].permute(1, 2, 0).numpy()))
+        pictures.append(difference_colors(to_array(difference)[0]))
     return [picture_png(picture, 224) for picture in pictures]
 
 
