@@ -1,22 +1,27 @@
-"""The command line: python -m stad_lab train | evaluate | study | benchmark | film | ship."""
+"""The command line: python -m stad_lab train | evaluate | verify | study | benchmark | film | ship."""
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import sys
+from collections.abc import Iterator
+from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.benchmark import PARTS, benchmark
-from stad_lab.checkpoints import load_json, save_json, write_bytes
+from stad_lab.checkpoints import check_writable, load_json, save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
 from stad_lab.film import film_agent, film_viewer
+from stad_lab.parallel import TaskError
 from stad_lab.pipeline import STAGES, ship, train
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
 from stad_lab.study import study
+from stad_lab.verify import verify
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -34,9 +39,16 @@ def build_parser() -> argparse.ArgumentParser:
         " difference image to what V sees, output to what it redraws)",
     )
 
+    scheduler = argparse.ArgumentParser(add_help=False)
+    scheduler.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="drive on a Dask cluster, for example tcp://10.0.0.1:8786; default: processes of this machine",
+    )
+
     command = commands.add_parser(
         "train",
-        parents=[variant],
+        parents=[variant, scheduler],
         help="collect, train V, train M, evolve C",
         description="Run all four stages. Stop it when you like; the same command goes on where it stopped.",
     )
@@ -57,7 +69,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser(
         "evaluate",
-        parents=[variant],
+        parents=[variant, scheduler],
         help="drive an agent on official, unseen tracks",
         description="Drive an agent on Gymnasium's own CarRacing-v3 and print mean, deviation, interval and share"
         " above 900; every episode goes into a JSON file.",
@@ -70,6 +82,14 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--json", type=Path, help="where to write the result; default evaluation-VARIANT.json in the run, or here"
     )
+
+    command = commands.add_parser(
+        "verify",
+        help="check a run's files, and drive three of its recorded episodes again",
+        description="Check that the files of a run are what they were and belong together, and that recorded episodes"
+        " can be driven again to the same return. The exit status is 1 if anything is not as it was.",
+    )
+    command.add_argument("run", type=Path, help="folder of the run")
 
     command = commands.add_parser(
         "study",
@@ -135,29 +155,51 @@ def changed_settings(preset: str | None, changes: list[str]) -> Settings:
     return Settings.preset(preset, **values)
 
 
+@contextlib.contextmanager
+def drivers(scheduler: str | None) -> Iterator[Executor | None]:
+    """The executor of a Dask cluster, or None for this machine's own processes."""
+    if scheduler is None:
+        yield None
+    else:
+        from stad_lab.cluster import cluster  # Dask takes a second to import, and few need it
+
+        with cluster(scheduler) as executor:
+            yield executor
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
     options = build_parser().parse_args(arguments)
     try:
         if options.command == "train":
             settings = changed_settings(options.settings, options.set)
-            if not train(options.variant, settings, options.out, options.rollouts, options.until):
+            with drivers(options.scheduler) as executor:
+                worked = train(options.variant, settings, options.out, options.rollouts, options.until, executor)
+            if not worked:
                 print(f"everything up to {options.until} is there in {options.out}: nothing to do")
         elif options.command == "evaluate":
-            result = evaluate(
-                options.variant, options.path, options.episodes, options.first_track, options.fast, options.processes
-            )
             file = options.json or (options.path or Path()) / f"evaluation-{options.variant}.json"
+            chosen = (options.variant, options.path, options.episodes, options.first_track, options.fast)
+            load_agent(*chosen[:2])
+            check_writable(file)
+            with drivers(options.scheduler) as executor:
+                result = evaluate(*chosen, options.processes, executor)
             save_json(file, result)
             print(describe(result))
             print(f"  every episode: {file}")
+        elif options.command == "verify":
+            found = verify(options.run)
+            print("\n".join(f"{name:<14} {outcome}" for name, outcome in found.items()))
+            return int(any(outcome.startswith("FAILED") for outcome in found.values()))
         elif options.command == "study":
             settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
             file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)
+            check_writable(file)
             before = load_json(file) if file.exists() else {}
             save_json(file, before | study(settings, rollouts, options.out, parts))
             print(f"every measurement: {file}")
         elif options.command == "benchmark":
+            check_writable(options.json)
             save_json(options.json, benchmark(options.part or list(PARTS), options.rounds))
             print(f"\nevery measurement: {options.json}")
         elif options.command == "ship":
@@ -166,9 +208,10 @@ def main(arguments: list[str] | None = None) -> int:
             agent = load_agent(options.variant, options.path)
             shown = (agent, options.track, options.first, options.frames)
             kind = options.out.suffix.lstrip(".").lower()
+            check_writable(options.out)
             write_bytes(options.out, film_viewer(*shown, kind=kind) if options.viewer else film_agent(*shown))
             print(f"filmed to {options.out}")
-    except (ValueError, OSError, FloatingPointError, BrokenProcessPool) as error:
+    except (ValueError, OSError, FloatingPointError, TaskError, BrokenProcessPool) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:

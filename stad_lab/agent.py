@@ -6,6 +6,7 @@ and the action. C sees the mean mu of z, not a sample: driving has no use for th
 
 import functools
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,7 +16,7 @@ from stad_lab.car_racing import MAX_FRAMES, make_env
 from stad_lab.checkpoints import load_tensors, save_tensors
 from stad_lab.controller import check_parameters, control, parameter_count
 from stad_lab.frames import FrameMemory, to_frame
-from stad_lab.mdn_rnn import MDNRNN, load_mdn_rnn
+from stad_lab.mdn_rnn import MDNRNN, check_partner, load_mdn_rnn
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 
@@ -143,11 +144,25 @@ def drive(
     return returns, lengths
 
 
-def read_world_model(folder: Path, variant: str) -> tuple[AutoEncoder, MDNRNN, int, bool]:
-    """V and M of a run, with stride and crop_bar."""
-    autoencoder, facts = load_autoencoder(folder / "autoencoder.safetensors", variant)
-    mdn_rnn, _ = load_mdn_rnn(folder / "mdn_rnn.safetensors", variant, autoencoder.latent_size)
-    return autoencoder, mdn_rnn, facts["stride"], facts["crop_bar"]
+class WorldModel(NamedTuple):
+    """V and M of one run, and how V's pictures are made."""
+
+    autoencoder: AutoEncoder
+    mdn_rnn: MDNRNN
+    stride: int
+    crop_bar: bool
+    identities: dict[str, str]
+    """Checksums by which C knows the "autoencoder" and the "mdn_rnn" that it was evolved with."""
+
+
+def read_world_model(folder: Path, variant: str) -> WorldModel:
+    """V and M of a run. Raises ValueError if they do not belong together, and as `load_autoencoder`."""
+    autoencoder, v_facts = load_autoencoder(folder / "autoencoder.safetensors", variant)
+    path = folder / "mdn_rnn.safetensors"
+    mdn_rnn, m_facts = load_mdn_rnn(path, variant, autoencoder.latent_size)
+    check_partner(path, m_facts, autoencoder=v_facts["identity"])
+    identities = {"autoencoder": v_facts["identity"], "mdn_rnn": m_facts["identity"]}
+    return WorldModel(autoencoder, mdn_rnn, v_facts["stride"], v_facts["crop_bar"], identities)
 
 
 load_world_model = functools.lru_cache(maxsize=2)(read_world_model)  # so that a worker process reads them once
@@ -182,9 +197,11 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
             f"{folder} is {'empty' if folder.is_dir() else 'not a folder'}: expected a run made by"
             f" `python -m stad_lab train --variant {variant} --out {folder}`"
         )
-    autoencoder, mdn_rnn, stride, crop_bar = read_world_model(folder, variant)
-    parameters = load_controller(folder / "controller.safetensors", variant)
-    return Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
+    world_model, path = read_world_model(folder, variant), folder / "controller.safetensors"
+    parameters, facts = load_controller(path, variant)
+    agent = Agent(world_model.autoencoder, world_model.mdn_rnn, parameters, world_model.stride, world_model.crop_bar)
+    check_partner(path, facts, **world_model.identities)
+    return agent
 
 
 def save_controller(path: Path, parameters: np.ndarray, **facts) -> None:
@@ -192,8 +209,8 @@ def save_controller(path: Path, parameters: np.ndarray, **facts) -> None:
     save_tensors(path, {"parameters": torch.from_numpy(parameters)}, part="controller", **facts)
 
 
-def load_controller(path: Path, variant: str) -> np.ndarray:
-    """Read C's parameters, float64 (parameters,).
+def load_controller(path: Path, variant: str) -> tuple[np.ndarray, dict]:
+    """Read C: (its parameters, float64 (parameters,), and the facts it was saved with).
 
     Raises:
         FileNotFoundError: no such file.
@@ -203,4 +220,4 @@ def load_controller(path: Path, variant: str) -> np.ndarray:
     check_part(path, facts, "controller", variant)
     parameters = tensors["parameters"].double().numpy()
     check_parameters(parameters, parameters.shape[-1], path)
-    return parameters
+    return parameters, facts

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from stad_lab.checkpoints import load_into, load_tensors, save_tensors
+from stad_lab.checkpoints import checksum_of_tensors, load_into, load_tensors, locked, save_tensors
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import fit, training_device
@@ -202,6 +202,11 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
     """Train V on the rollouts and write `autoencoder.safetensors` into `folder`; resumes, and returns False if done.
 
     The last twentieth of the episodes is held out; training has a fixed length, and the history shows both losses.
+
+    Raises:
+        ValueError: the weights, checkpoint or rollouts in the folders are damaged or of another run.
+        OSError: another process works in the folder, or a file cannot be read or written.
+        FloatingPointError: the loss is not finite.
     """
     path = Path(folder) / "autoencoder.safetensors"
     if path.exists():
@@ -235,11 +240,12 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
 
     checkpoint = path.with_name("autoencoder.training.safetensors")
     label = f"train V ({variant})"
-    history = fit(
-        autoencoder, batch, losses, heldout_losses, settings.v_steps, settings.v_learning_rate, checkpoint, label
-    )
-    save_autoencoder(path, autoencoder, settings, history)
-    checkpoint.unlink()
+    identity = {"part": "autoencoder", "variant": variant, "rollouts": rollouts.identity, **settings.as_dict()}
+    steps, rate = settings.v_steps, settings.v_learning_rate
+    with locked(path.parent):
+        history = fit(autoencoder, batch, losses, heldout_losses, steps, rate, checkpoint, label, identity)
+        save_autoencoder(path, autoencoder, settings, history, rollouts.identity)
+        checkpoint.unlink()
     return True
 
 
@@ -248,10 +254,17 @@ def check_facts(path: Path, facts: dict, settings: Settings) -> None:
     check_same_run(path, facts, {name: wanted for name, wanted in settings.as_dict().items() if name in facts})
 
 
-def save_autoencoder(path: Path, autoencoder: AutoEncoder, settings: Settings, history: list) -> None:
-    """Write V's weights with what is needed to build it again and to feed it as it was trained."""
+def save_autoencoder(
+    path: Path, autoencoder: AutoEncoder, settings: Settings, history: list, rollouts: str | None = None
+) -> None:
+    """Write V's weights with what is needed to build it again and to feed it as it was trained.
+
+    Its identity, by which M and C know the V that they were trained with, is a checksum of the weights; that of the
+    rollouts says what it has seen.
+    """
     facts = {"part": "autoencoder", "variant": autoencoder.variant, "width": autoencoder.width}
     facts |= {"latent_size": autoencoder.latent_size, "stride": settings.stride, "crop_bar": settings.crop_bar}
+    facts |= {"identity": checksum_of_tensors(autoencoder.state_dict()), "rollouts": rollouts}
     save_tensors(path, autoencoder.state_dict(), **facts, history=history)
 
 

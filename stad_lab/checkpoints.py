@@ -1,71 +1,169 @@
-"""Files that survive: atomic writes and checked reads, shared by V, M and C.
+"""Files that survive: atomic, durable writes, reads that notice every changed bit, and one owner for a folder.
 
 Weights are safetensors, everything else is JSON; nothing that is read can run code. A file is written under another
-name, flushed to the disk and then renamed, so a reader sees the old version or the new one, never half of one.
+name, flushed to the disk and then renamed, so a reader sees the old version or the new one, never half of one. Every
+file carries a checksum of what it says, and is not used if that has changed.
 """
 
 import hashlib
 import json
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
+from filelock import FileLock, Timeout
+from safetensors.torch import load, save
 
 KIND = "stad_lab"
+CHECKSUM = "checksum"
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Own a folder for a `with` block; makes it if it is missing, and clears away what a killed process left half-done.
+
+    The operating system frees the lock when the process ends, however it ends. A process may lock a folder repeatedly.
+
+    Raises:
+        OSError: another process works in the folder, or nobody may write there.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
+        lock.acquire()
+    except Timeout:
+        raise BlockingIOError(
+            f"{folder} is in use by another process: wait until that has ended, or choose another folder"
+        ) from None
+    except OSError as error:
+        raise OSError(f"{folder} is no folder to write to ({error.strerror}): choose another one") from error
+    try:
+        for left_over in folder.glob(".*.part"):
+            left_over.unlink(missing_ok=True)
+        yield
+    finally:
+        lock.release()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that a crash at any moment leaves the old version or the new one."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Write a file so that a crash or a power cut at any moment leaves the old version or the new one.
+
+    Raises:
+        OSError: the disk is full or not to be written; the old version is still there.
+    """
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise OSError(
+            f"{path} could not be written ({error.strerror}): see to free room and to the right to write there;"
+            " what was in it before is unchanged"
+        ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
-def checksum(path: Path) -> str:
-    """SHA-256 of a file, in hexadecimal digits."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def sync_folder(folder: Path) -> None:
+    """Make a rename in the folder last through a power cut, where the system lets a folder be opened (not Windows)."""
+    if os.name != "nt":
+        opened = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(opened)
+        finally:
+            os.close(opened)
 
 
-def save_json(path: Path, value) -> None:
-    """Write `value` as JSON, atomically."""
-    write_bytes(path, (json.dumps(value, indent=1) + "\n").encode())
+def check_writable(path: Path) -> None:
+    """Raise OSError, before any work, if the file `path` could not be written at its end."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder: give the name of a file")
+    write_bytes(path.with_name(f".{path.name}.trial.part"), b"")
+    path.with_name(f".{path.name}.trial.part").unlink()
 
 
-def load_json(path: Path, remedy: str = "make it again"):
-    """Read a JSON file.
+def read_bytes(path: Path, remedy: str) -> bytes:
+    """Read a file.
 
     Raises:
         FileNotFoundError: no such file; the message carries the remedy.
-        ValueError: the file is damaged.
+        OSError: there is something, but it cannot be read.
     """
-    require_file(path, remedy)
     try:
-        return json.loads(path.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is damaged ({error}): delete it and {remedy}") from error
-
-
-def require_file(path: Path, remedy: str) -> None:
-    """Raise FileNotFoundError, naming the remedy, unless the file exists."""
-    if not path.is_file():
+        return path.read_bytes()
+    except FileNotFoundError:
         where = "" if path.parent.is_dir() else f" (there is no folder {path.parent})"
-        raise FileNotFoundError(f"{path} does not exist{where}: {remedy}")
+        raise FileNotFoundError(f"{path} does not exist{where}: {remedy}") from None
+    except OSError as error:
+        raise OSError(
+            f"{path} cannot be read ({error.strerror}): make it readable, or move it away and {remedy}"
+        ) from error
+
+
+def checksum(content: bytes) -> str:
+    """SHA-256 of some bytes, in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()
+
+
+def save_json(path: Path, value: dict) -> None:
+    """Write a dict as JSON, atomically, with a checksum of the rest as its last entry."""
+    value = {name: part for name, part in value.items() if name != CHECKSUM}
+    write_bytes(path, (json.dumps(value | {CHECKSUM: checksum_of_json(value)}, indent=1) + "\n").encode())
+
+
+def checksum_of_json(value) -> str:
+    """SHA-256 of what JSON says, whatever its spaces and line ends."""
+    return checksum(json.dumps(json.loads(json.dumps(value))).encode())
+
+
+def load_json(path: Path, remedy: str = "make it again") -> dict:
+    """Read what `save_json` wrote.
+
+    Raises:
+        FileNotFoundError: no such file; the message carries the remedy.
+        OSError: it cannot be read.
+        ValueError: the file is damaged, or was changed by hand.
+    """
+    content = read_bytes(path, remedy)
+    try:
+        value = json.loads(content)
+        wanted = value.pop(CHECKSUM)
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
+        raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
+    if checksum_of_json(value) != wanted:
+        raise damaged(path, "it does not say what its checksum was made of", remedy)
+    return value
+
+
+def damaged(path: Path, reason: str, remedy: str) -> ValueError:
+    """The error for a file that is not as it was written."""
+    return ValueError(f"{path} is damaged ({reason}): delete it and {remedy}")
 
 
 def save_tensors(path: Path, tensors: dict[str, torch.Tensor], **facts) -> None:
-    """Write tensors as safetensors, atomically, with `facts` (anything JSON can say) in the file's header."""
+    """Write tensors as safetensors, atomically, with `facts` (anything JSON can say) and a checksum in its header."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    write_bytes(path, save(tensors, metadata={KIND: json.dumps(facts)}))
+    # In one entry: safetensors writes several in any order, and the same content should be the same bytes.
+    said = json.dumps(facts | {CHECKSUM: checksum_of_tensors(tensors, json.dumps(facts))})
+    write_bytes(path, save(tensors, metadata={KIND: said}))
+
+
+def checksum_of_tensors(tensors: dict[str, torch.Tensor], said: str = "") -> str:
+    """SHA-256 of names, types, shapes and values of tensors, and of what else is said about them."""
+    found = hashlib.sha256(said.encode())
+    for name in sorted(tensors):
+        tensor = tensors[name].detach().cpu().contiguous()
+        found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
 
 
 def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, torch.Tensor], dict]:
@@ -73,17 +171,21 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
 
     Raises:
         FileNotFoundError: no such file; the message carries the remedy.
+        OSError: it cannot be read.
         ValueError: the file is damaged, or was not written by stad_lab.
     """
-    require_file(path, remedy)
+    content = read_bytes(path, remedy)
     try:
-        with safe_open(path, framework="pt") as file:
-            facts = json.loads((file.metadata() or {}).get(KIND, "null"))
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is damaged ({error}): delete it and {remedy}") from error
-    if facts is None:
+        tensors = load(content)
+        header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+        facts = json.loads(header.get("__metadata__", {}).get(KIND, "null"))
+    except Exception as error:  # the parser meets bytes of any kind, and has many ways to say so
+        raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
+    if not isinstance(facts, dict):
         raise ValueError(f"{path} was not written by stad_lab: give a file that `python -m stad_lab train` made")
+    wanted = facts.pop(CHECKSUM, None)
+    if checksum_of_tensors(tensors, json.dumps(facts)) != wanted:
+        raise damaged(path, "it does not hold what its checksum was made of", remedy)
     return tensors, facts
 
 

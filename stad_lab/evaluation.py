@@ -5,6 +5,7 @@ training nor validation ever touches. Each track is named by its seed, so anyone
 """
 
 import time
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,8 @@ from tqdm.auto import tqdm
 
 from stad_lab.agent import load_agent, run_folder
 from stad_lab.checkpoints import checksum
-from stad_lab.evolution import drive_group
-from stad_lab.parallel import worker_processes
+from stad_lab.evolution import drive_group, hand_out
+from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.rollouts import TRACK_RANGES
 
 SOLVED = 900  # CarRacing counts as solved at a mean return of 900 over 100 tracks
@@ -26,6 +27,7 @@ def evaluate(
     first_track: int = 0,
     fast: bool = False,
     processes: int = 2,
+    executor: Executor | None = None,
 ) -> dict:
     """Drive an agent on the tracks first_track, first_track + 1, ... and sum up.
 
@@ -36,6 +38,7 @@ def evaluate(
         first_track: seed of the first track.
         fast: draw with the fast renderer instead of Gymnasium's own.
         processes: worker processes; the numbers do not depend on it.
+        executor: who drives; None for so many processes of this machine.
 
     Returns:
         A dict for JSON: "mean", "standard_deviation", "interval" (95%, of the mean), "above_900" (share of episodes),
@@ -44,6 +47,7 @@ def evaluate(
     Raises:
         ValueError: tracks outside the range that is kept for tests, or an agent that cannot be loaded.
         FileNotFoundError: no such agent.
+        TaskError: an episode failed.
     """
     low, high = TRACK_RANGES["test"]
     if episodes < 1 or not low <= first_track <= high - episodes:
@@ -55,15 +59,17 @@ def evaluate(
     folder = run_folder(variant, path)
     begin = time.perf_counter()
     tracks = list(range(first_track, first_track + episodes))
-    with worker_processes(processes) as executor:
+    with worker_processes(processes, executor) as executor:
         # One car at a time: in a batch the last bits differ, and a script that drives alone should get these numbers.
-        futures = [executor.submit(drive_group, folder, variant, agent.parameters, [t], fast, None) for t in tracks]
-        results = [future.result() for future in tqdm(futures, f"evaluate ({variant})", unit="episode")]
-    returns, frames = (np.concatenate(part) for part in zip(*results, strict=True))
+        source = hand_out(executor, folder, variant)
+        tasks = [(source, variant, agent.parameters, [track], fast, None) for track in tracks]
+        results = tqdm(run_tasks(executor, drive_group, tasks), f"evaluate ({variant})", len(tasks), unit="episode")
+        found = dict(results)
+    returns, frames = (np.concatenate(part) for part in zip(*(found[n] for n in range(len(tasks))), strict=True))
     return {
         "variant": variant,
         "renderer": "fast" if fast else "official",
-        "controller_sha256": checksum(folder / "controller.safetensors"),
+        "controller_sha256": checksum((folder / "controller.safetensors").read_bytes()),
         **summarise(returns),
         "seconds": time.perf_counter() - begin,
         "episodes": [

@@ -12,16 +12,26 @@ import math
 import zlib
 from concurrent.futures import Executor
 from pathlib import Path
+from typing import Any
 
 import cma
 import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from stad_lab.agent import Agent, drive, load_controller, load_world_model, save_controller
-from stad_lab.checkpoints import load_json, save_json
+from stad_lab.agent import (
+    Agent,
+    WorldModel,
+    drive,
+    load_controller,
+    load_world_model,
+    read_world_model,
+    save_controller,
+)
+from stad_lab.checkpoints import load_json, locked, save_json
 from stad_lab.controller import initial_parameters
-from stad_lab.parallel import return_freed_memory, worker_processes
+from stad_lab.mdn_rnn import check_partner
+from stad_lab.parallel import return_freed_memory, run_tasks, use_one_thread, worker_processes
 from stad_lab.rollouts import track_seeds
 from stad_lab.settings import Settings, check_same_run
 
@@ -29,62 +39,112 @@ LOG = "evolution.json"
 CONTROLLER = "controller.safetensors"
 
 
-def evolve(variant: str, settings: Settings, folder: Path) -> bool:
+def evolve(variant: str, settings: Settings, folder: Path, executor: Executor | None = None) -> bool:
     """Evolve C for the V and M in `folder`; writes `evolution.json` after every generation and the best C found.
 
     Every agent of a generation drives the same few tracks; its fitness is its mean return. From time to time the mean
     of the search distribution drives the validation tracks, and the best such mean is kept as `controller.safetensors`:
     choosing the best *agent* instead would choose the luckiest.
 
+    Args:
+        executor: who drives; None for `settings.processes` processes of this machine.
+
     Returns:
-        False if the run was complete already, True if generations were driven.
+        False if the run was complete already, True if there was something to do.
 
     Raises:
-        ValueError: the log in `folder` was made with other settings.
+        ValueError: a file in `folder` is damaged, of another run, or of other settings; or an action is not finite.
+        OSError: another process works in the folder, or a file cannot be read or written.
+        TaskError: a drive failed, or no worker answers.
         KeyboardInterrupt: passed on; the log holds every finished generation.
     """
     folder = Path(folder)
-    log = read_log(variant, settings, folder)
-    if (folder / CONTROLLER).exists():
-        load_controller(folder / CONTROLLER, variant)
-        if len(log["generations"]) >= settings.generations:
-            return False
-    with threadpool_limits(1), worker_processes(settings.processes) as executor:
-        strategy = resume(variant, settings, folder, log)
+    world_model = read_world_model(folder, variant)
+    log = read_log(variant, settings, folder, world_model)
+    kept = kept_generation(variant, folder, log)
+    if log["best"] and kept == log["best"]["generation"] and len(log["generations"]) >= settings.generations:
+        return False
+    with locked(folder), threadpool_limits(1), worker_processes(settings.processes, executor) as executor:
+        strategy = resume(variant, settings, folder, log, world_model, kept)
+        source = hand_out(executor, folder, variant)
         done = len(log["generations"])
         progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
         for generation in progress:
             population = np.array(strategy.ask())
-            entry = drive_generation(executor, folder, variant, settings, generation, population)
+            entry = drive_generation(executor, source, variant, settings, generation, population)
             strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
-            entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy)}
+            entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
             if (generation + 1) % settings.validate_every == 0:
-                validate(executor, folder, variant, settings, strategy.mean, entry, log)
+                entry["validation"] = validate(executor, source, variant, settings, strategy.mean)
             log["generations"].append(entry)
+            better = note_best(log)
             save_json(folder / LOG, log)
+            if better:  # after the log: a controller that the log does not know would be a stranger
+                keep_controller(variant, folder, log, strategy.mean, world_model)
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
     return True
 
 
-def resume(variant: str, settings: Settings, folder: Path, log: dict) -> cma.CMAEvolutionStrategy:
-    """The strategy as the log left it; makes `controller.safetensors` again if it was lost."""
-    autoencoder, mdn_rnn, *_ = load_world_model(folder, variant)
-    start = initial_parameters(autoencoder.latent_size, mdn_rnn.hidden_size, settings.initial_gas)
-    if log["best"] and not (folder / CONTROLLER).exists():
+def resume(
+    variant: str, settings: Settings, folder: Path, log: dict, world_model: WorldModel, kept: int | None
+) -> cma.CMAEvolutionStrategy:
+    """The strategy as the log left it; makes `controller.safetensors` again if it was lost, or is not yet the best."""
+    latent_size, hidden_size = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
+    start = initial_parameters(latent_size, hidden_size, settings.initial_gas)
+    if log["best"] and log["best"]["generation"] != kept:
         best = replay(start, settings, log["generations"][: log["best"]["generation"]])
-        save_controller(folder / CONTROLLER, best.mean, variant=variant, **log["best"])
+        keep_controller(variant, folder, log, best.mean, world_model)
     return replay(start, settings, log["generations"])
 
 
-def read_log(variant: str, settings: Settings, folder: Path) -> dict:
-    """The log of the run in `folder`, or a new one. Raises ValueError if it was made with other settings."""
-    new = {"variant": variant, "settings": settings.as_dict(), "best": None, "generations": []}
+def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldModel) -> dict:
+    """The log of the run in `folder`, or a new one.
+
+    Raises:
+        ValueError: it is damaged, or was made with other settings, another V or another M.
+    """
+    new = {"variant": variant, "settings": settings.as_dict(), **world_model.identities, "best": None}
     if not (folder / LOG).exists():
-        return new
-    log = load_json(folder / LOG)
+        return new | {"generations": []}
+    log = load_json(folder / LOG, "evolve C again")
     check_same_run(folder, {"variant": log["variant"], **log["settings"]}, {"variant": variant, **new["settings"]})
+    check_partner(folder / LOG, log, **world_model.identities)
     return log | {"settings": new["settings"]}
+
+
+def kept_generation(variant: str, folder: Path, log: dict) -> int | None:
+    """The generation that `controller.safetensors` is the mean of, by the log; None if there is no such file.
+
+    Raises:
+        ValueError: it is damaged, or the log does not know it.
+    """
+    path = folder / CONTROLLER
+    if not path.exists():
+        return None
+    parameters, facts = load_controller(path, variant)
+    validated = {entry["generation"]: entry["mean_checksum"] for entry in log["generations"] if "validation" in entry}
+    generation = facts.get("generation")
+    if mean_checksum(parameters) != validated.get(generation):
+        raise ValueError(
+            f"{path} does not come from the run that {folder / LOG} tells of: move it away, and the same command makes"
+            " the right one"
+        )
+    return generation
+
+
+def note_best(log: dict) -> bool:
+    """Note in the log which mean has driven the validation tracks best; True if it is that of the last generation."""
+    last = log["generations"][-1]
+    if "validation" not in last or (log["best"] and last["validation"]["mean"] <= log["best"]["validation"]):
+        return False
+    log["best"] = {"generation": last["generation"], "validation": last["validation"]["mean"]}
+    return True
+
+
+def keep_controller(variant: str, folder: Path, log: dict, mean: np.ndarray, world_model: WorldModel) -> None:
+    """Write C, with what it has to do with the log and with V and M."""
+    save_controller(folder / CONTROLLER, mean, variant=variant, **log["best"], **world_model.identities)
 
 
 def make_strategy(start: np.ndarray, settings: Settings) -> cma.CMAEvolutionStrategy:
@@ -110,7 +170,7 @@ def replay(start: np.ndarray, settings: Settings, generations: list[dict]) -> cm
     for number, entry in enumerate(generations):
         population = strategy.ask()
         strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
-        if mean_checksum(strategy) != entry["mean_checksum"]:
+        if mean_checksum(strategy.mean) != entry["mean_checksum"]:
             raise ValueError(
                 f"replaying the log gives another mean in generation {number + 1} than the run had: the log was"
                 " changed, or made on another machine or by other versions of cma and numpy. Start in a new folder"
@@ -118,18 +178,28 @@ def replay(start: np.ndarray, settings: Settings, generations: list[dict]) -> cm
     return strategy
 
 
-def mean_checksum(strategy: cma.CMAEvolutionStrategy) -> int:
+def mean_checksum(mean: np.ndarray) -> int:
     """CRC-32 of the mean's bytes: two strategies that agree in it agree to the last bit."""
-    return zlib.crc32(np.ascontiguousarray(strategy.mean).tobytes())
+    return zlib.crc32(np.ascontiguousarray(mean).tobytes())
+
+
+def hand_out(executor: Executor, folder: Path, variant: str) -> Any:
+    """What tells a worker which V and M to drive with.
+
+    On this machine that is their folder. On a cluster there may be no common disk: V and M themselves, which the
+    executor's `share` brings once to every worker that needs them.
+    """
+    share = getattr(executor, "share", None)
+    return share(read_world_model(folder, variant)) if share else Path(folder)
 
 
 def drive_generation(
-    executor: Executor, folder: Path, variant: str, settings: Settings, generation: int, population: np.ndarray
+    executor: Executor, source: Any, variant: str, settings: Settings, generation: int, population: np.ndarray
 ) -> dict:
     """Let every agent drive the generation's tracks; returns the log's entry with "returns" [agent][track]."""
     tracks = track_seeds("evolve", settings.tracks, settings.seed, generation)
     agents = np.repeat(population, len(tracks), axis=0)
-    returns, lengths = drive_parallel(executor, folder, variant, agents, tracks * len(population), settings)
+    returns, lengths = drive_parallel(executor, source, variant, agents, tracks * len(population), settings)
     shape = (len(population), len(tracks))
     return {
         "generation": generation + 1,
@@ -139,22 +209,17 @@ def drive_generation(
     }
 
 
-def validate(
-    executor: Executor, folder: Path, variant: str, settings: Settings, mean: np.ndarray, entry: dict, log: dict
-) -> None:
-    """Drive the CMA mean on the validation tracks; notes it in `entry`, and keeps it as C if it is the best so far."""
+def validate(executor: Executor, source: Any, variant: str, settings: Settings, mean: np.ndarray) -> dict:
+    """Drive the CMA mean on the validation tracks: its mean return, all returns, and the frames that it took."""
     tracks = track_seeds("validate", settings.validation_tracks)  # the same ones for every seed
     means = np.repeat(mean[None], len(tracks), axis=0)
     patient = dataclasses.replace(settings, patience=0)  # as in the final evaluation: nobody is given up on
-    returns, lengths = drive_parallel(executor, folder, variant, means, tracks, patient)
-    entry["validation"] = {"mean": float(returns.mean()), "returns": returns.tolist(), "frames": int(lengths.sum())}
-    if log["best"] is None or returns.mean() > log["best"]["validation"]:
-        log["best"] = {"generation": entry["generation"], "validation": float(returns.mean())}
-        save_controller(folder / CONTROLLER, mean, variant=variant, **log["best"])
+    returns, lengths = drive_parallel(executor, source, variant, means, tracks, patient)
+    return {"mean": float(returns.mean()), "returns": returns.tolist(), "frames": int(lengths.sum())}
 
 
 def drive_parallel(
-    executor: Executor, folder: Path, variant: str, parameters: np.ndarray, tracks: list[int], settings: Settings
+    executor: Executor, source: Any, variant: str, parameters: np.ndarray, tracks: list[int], settings: Settings
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode for each row of `parameters` (episodes, parameters): (returns, lengths in frames).
 
@@ -163,20 +228,24 @@ def drive_parallel(
     """
     size = min(settings.cars, math.ceil(len(tracks) / 2))
     groups = [slice(start, start + size) for start in range(0, len(tracks), size)]
-    futures = [
-        executor.submit(drive_group, folder, variant, parameters[group], tracks[group], True, settings)
-        for group in groups
-    ]
-    results = [future.result() for future in futures]
-    returns, lengths = (np.concatenate(part) for part in zip(*results, strict=True))
+    tasks = [(source, variant, parameters[group], tracks[group], True, settings) for group in groups]
+    found = dict(run_tasks(executor, drive_group, tasks))
+    returns, lengths = (np.concatenate(part) for part in zip(*(found[n] for n in range(len(tasks))), strict=True))
     return returns, lengths
 
 
 def drive_group(
-    folder: Path, variant: str, parameters: np.ndarray, tracks: list[int], fast: bool, limits: Settings | None
+    source: Path | WorldModel,
+    variant: str,
+    parameters: np.ndarray,
+    tracks: list[int],
+    fast: bool,
+    limits: Settings | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a worker process does: load V and M once, drive a group of cars in step."""
-    autoencoder, mdn_rnn, stride, crop_bar = load_world_model(folder, variant)
+    use_one_thread()
+    world_model = source if isinstance(source, WorldModel) else load_world_model(source, variant)
+    autoencoder, mdn_rnn, stride, crop_bar, _ = world_model
     agent = Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
     rules = {"max_frames": limits.max_frames, "patience": limits.patience} if limits else {}
     return_freed_memory()

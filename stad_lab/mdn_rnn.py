@@ -14,7 +14,7 @@ from torch import nn
 from tqdm.auto import tqdm
 
 from stad_lab.autoencoder import REMEDY, AutoEncoder, check_facts, check_part, load_autoencoder, to_pictures
-from stad_lab.checkpoints import load_into, load_tensors, save_tensors
+from stad_lab.checkpoints import checksum_of_tensors, load_into, load_tensors, locked, save_tensors
 from stad_lab.frames import earlier_frames
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
@@ -172,20 +172,29 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     """Train M on what V, in `folder`, makes of the rollouts, and write `mdn_rnn.safetensors` beside it.
 
     Resumes, and returns False if it was done already.
+
+    Raises:
+        ValueError: the weights, checkpoint or rollouts in the folders are damaged or of another run.
+        OSError: another process works in the folder, or a file cannot be read or written.
+        FloatingPointError: the loss is not finite.
     """
     path = Path(folder) / "mdn_rnn.safetensors"
-    if path.exists():
-        check_facts(path, load_mdn_rnn(path, variant)[1], settings)
-        return False
     v_path = path.with_name("autoencoder.safetensors")
     autoencoder, v_facts = load_autoencoder(v_path, variant)
     check_facts(v_path, v_facts, settings)
+    if path.exists():
+        facts = load_mdn_rnn(path, variant)[1]
+        check_facts(path, facts, settings)
+        check_partner(path, facts, autoencoder=v_facts["identity"])
+        return False
     rollouts = Rollouts(rollouts_folder)
+    if v_facts["rollouts"] != rollouts.identity:
+        raise ValueError(f"{v_path} was trained on other rollouts than those in {rollouts_folder}: give its own ones")
     torch.manual_seed(settings.seed)
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)
     encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
-    fit_mdn_rnn(path, mdn_rnn, variant, encoded, rollouts.actions, rollouts, settings)
+    fit_mdn_rnn(path, mdn_rnn, variant, v_facts["identity"], encoded, rollouts.actions, rollouts, settings)
     return True
 
 
@@ -193,6 +202,7 @@ def fit_mdn_rnn(
     path: Path,
     mdn_rnn: MDNRNN,
     variant: str,
+    autoencoder: str,
     encoded: list[np.ndarray],
     actions: list[np.ndarray],
     rollouts: Rollouts,
@@ -200,7 +210,8 @@ def fit_mdn_rnn(
 ) -> None:
     """Train M on encoded episodes (see `encode_rollouts`) and the actions that it is shown, and write it to `path`.
 
-    Training has a fixed length; the rollouts say which episodes are held out. It resumes.
+    Training has a fixed length; the rollouts say which episodes are held out, `autoencoder` is the identity of the V
+    that has encoded them. It resumes.
     """
     device, first_heldout = next(mdn_rnn.parameters()).device, rollouts.episode[rollouts.split()[1][0]]
 
@@ -220,17 +231,27 @@ def fit_mdn_rnn(
         return {"total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))["total"].item()}
 
     checkpoint = path.with_name("mdn_rnn.training.safetensors")
-    history = fit(
-        mdn_rnn, batch, losses, heldout_losses, settings.m_steps, settings.m_learning_rate, checkpoint, "train M"
-    )
-    save_mdn_rnn(path, mdn_rnn, variant, history)
-    checkpoint.unlink()
+    identity = {"part": "mdn_rnn", "variant": variant, "autoencoder": autoencoder, "rollouts": rollouts.identity}
+    identity |= settings.as_dict()
+    steps, rate = settings.m_steps, settings.m_learning_rate
+    with locked(path.parent):
+        history = fit(mdn_rnn, batch, losses, heldout_losses, steps, rate, checkpoint, "train M", identity)
+        save_mdn_rnn(path, mdn_rnn, variant, history, autoencoder)
+        checkpoint.unlink()
 
 
-def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list) -> None:
-    """Write M's weights with what is needed to build it again, and the variant of the V that it belongs to."""
+def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list, autoencoder: str | None = None) -> None:
+    """Write M's weights with what is needed to build it again, and the variant and identity of the V it belongs to."""
     sizes = {name: getattr(mdn_rnn, name) for name in ("latent_size", "hidden_size", "mixtures")}
-    save_tensors(path, mdn_rnn.state_dict(), part="mdn_rnn", variant=variant, **sizes, history=history)
+    facts = {"part": "mdn_rnn", "variant": variant, **sizes, "autoencoder": autoencoder, "history": history}
+    save_tensors(path, mdn_rnn.state_dict(), identity=checksum_of_tensors(mdn_rnn.state_dict()), **facts)
+
+
+def check_partner(path: Path, facts: dict, **identities: str) -> None:
+    """Raise ValueError unless a file's facts name the V, and the M, of these identities as those it was made with."""
+    for part, identity in identities.items():
+        if facts.get(part) != identity:
+            raise ValueError(f"{path} was made with another {part} than the one beside it: give V, M and C of one run")
 
 
 def load_mdn_rnn(path: Path, variant: str | None = None, latent_size: int | None = None) -> tuple[MDNRNN, dict]:

@@ -1,6 +1,7 @@
 """Worker processes: one way to start them for collecting, evolving and evaluating.
 
-Any `concurrent.futures.Executor` serves; this is the one a laptop has built in.
+Any `concurrent.futures.Executor` serves; this is the one that a laptop has built in. Work that is lost with a killed or
+stuck worker is done again: what a task returns depends on its arguments alone, so nobody can tell afterwards.
 """
 
 import ctypes
@@ -11,8 +12,10 @@ import platform
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,30 +23,156 @@ import cv2
 import torch
 
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # from glibc's malloc.h
+TIME_LIMIT = 600.0  # seconds without any finished task, after which the workers count as stuck; a task takes some 10
+LOSSES = 3  # pools that may be lost in a row, before we stop to believe that it was an accident
 
 
-@contextmanager
-def worker_processes(count: int) -> Iterator[ProcessPoolExecutor]:
-    """A pool of `count` fresh Python processes that compute with one thread each, for a `with` block.
+class TaskError(RuntimeError):
+    """A task failed in a worker, or nobody has finished one for too long; the message says which and why."""
 
-    They ignore Ctrl-C (the parent decides what an interrupt means) and end themselves when the parent is gone. If the
-    block is left by an interrupt or an error, they are stopped at once: nobody waits for the cars on the road.
+
+class WorkerProcesses(Executor):
+    """A pool of fresh Python processes, one thread each, that outlives its workers.
+
+    A worker that is killed breaks Python's own pool for good. Here a new pool takes over what was not finished. The
+    same happens if no task is finished for `time_limit` seconds: then the workers are stuck, and are killed.
 
     Raises:
         ValueError: fewer than 1 process.
     """
-    if count < 1:
-        raise ValueError(f"processes={count}: expected at least 1; as many as the machine has cores is a good choice")
-    context = multiprocessing.get_context("spawn")  # fork and torch's threads do not go together
-    executor = ProcessPoolExecutor(count, mp_context=context, initializer=start_worker)
+
+    def __init__(self, count: int, time_limit: float = TIME_LIMIT):
+        if count < 1:
+            raise ValueError(
+                f"processes={count}: expected at least 1; as many as the machine has cores is a good choice"
+            )
+        self.count, self.time_limit = count, time_limit
+        self.lock, self.closed = threading.RLock(), threading.Event()
+        self.losses, self.unfinished, self.last_sign = 0, 0, time.monotonic()
+        self.pool = self._new_pool()
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def submit(self, function: Callable, /, *arguments, **named) -> Future:
+        """As for every Executor: the promise of what `function` returns."""
+        task = Future()
+        task.set_running_or_notify_cancel()
+        with self.lock:
+            self.unfinished += 1
+        self._begin(task, functools.partial(function, *arguments, **named))
+        return task
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """As for every Executor."""
+        self.closed.set()
+        self.pool.shutdown(wait, cancel_futures=cancel_futures)
+
+    def stop(self) -> None:
+        """End the processes at once, whatever they do."""
+        for process in list((self.pool._processes or {}).values()):  # there is no public way to them before Python 3.14
+            process.kill()
+
+    def _new_pool(self) -> ProcessPoolExecutor:
+        context = multiprocessing.get_context("spawn")  # fork and torch's threads do not go together
+        return ProcessPoolExecutor(self.count, mp_context=context, initializer=start_worker)
+
+    def _begin(self, task: Future, work: Callable) -> None:
+        with self.lock:
+            pool = self.pool
+            try:
+                attempt = pool.submit(work)
+            except BrokenProcessPool as error:  # it broke a moment ago
+                attempt = Future()
+                attempt.set_exception(error)
+        attempt.add_done_callback(functools.partial(self._end, task, work, pool))
+
+    def _end(self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future) -> None:
+        error = BrokenProcessPool("the workers were stopped") if attempt.cancelled() else attempt.exception()
+        if isinstance(error, BrokenProcessPool) and not self.closed.is_set() and self._replace(pool):
+            self._begin(task, work)
+            return
+        with self.lock:
+            self.unfinished -= 1
+            self.last_sign = time.monotonic()
+            self.losses = 0 if error is None else self.losses
+        if error is None:
+            task.set_result(attempt.result())
+        else:
+            task.set_exception(error)
+
+    def _replace(self, lost: ProcessPoolExecutor) -> bool:
+        """Start a new pool for a lost one, unless another task has done so already; False after too many losses."""
+        with self.lock:
+            if lost is self.pool:
+                self.losses += 1
+                if self.losses > LOSSES:
+                    return False
+                print("a worker process was lost: starting new ones, which do its work again", file=sys.stderr)
+                self.pool, self.last_sign = self._new_pool(), time.monotonic()
+            return True
+
+    def _watch(self) -> None:
+        while not self.closed.wait(min(1.0, self.time_limit / 4)):
+            with self.lock:
+                silence = time.monotonic() - self.last_sign
+                if not self.unfinished:
+                    self.last_sign = time.monotonic()
+                elif silence > self.time_limit:
+                    print(f"no worker has finished anything for {silence:.0f} seconds: they are stuck", file=sys.stderr)
+                    self.stop()
+
+
+@contextmanager
+def worker_processes(count: int, given: Executor | None = None, time_limit: float = TIME_LIMIT) -> Iterator[Executor]:
+    """A pool of `count` processes for a `with` block; or the executor that is given, which stays open afterwards.
+
+    The processes ignore Ctrl-C (the parent decides what an interrupt means) and end themselves when the parent is gone.
+    If the block is left by an interrupt or an error, they are stopped at once: nobody waits for the cars on the road.
+
+    Raises:
+        ValueError: fewer than 1 process.
+    """
+    if given is not None:
+        yield given
+        return
+    executor = WorkerProcesses(count, time_limit)
     try:
         yield executor
     except BaseException:
-        for process in list(executor._processes.values()):  # there is no public way to them before Python 3.14
-            process.terminate()
+        executor.closed.set()
+        executor.stop()
         raise
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+def run_tasks(
+    executor: Executor, function: Callable, tasks: list[tuple], time_limit: float = 2 * LOSSES * TIME_LIMIT
+) -> Iterator[tuple[int, object]]:
+    """Call `function(*task)` for every task, and yield (number of the task, what it returned) as they are finished.
+
+    Raises:
+        ValueError, OSError: as raised by a task.
+        TaskError: a task failed otherwise, or no task was finished for `time_limit` seconds.
+    """
+    waiting = {executor.submit(function, *task): number for number, task in enumerate(tasks)}
+    try:
+        while waiting:
+            done, _ = wait(waiting, time_limit, return_when=FIRST_COMPLETED)
+            if not done:
+                raise TaskError(f"nothing was heard of the workers for {time_limit:.0f} seconds: see whether they live")
+            for future in done:
+                number = waiting.pop(future)
+                try:
+                    result = future.result()
+                except (ValueError, OSError):
+                    raise
+                except Exception as error:
+                    name = getattr(function, "__name__", function)
+                    raise TaskError(f"{name} failed in a worker: {type(error).__name__}: {error}") from error
+                yield number, result
+    finally:
+        for future in waiting:
+            future.cancel()
 
 
 def keep_freed_memory() -> None:
@@ -96,9 +225,15 @@ def start_worker() -> None:
     """Prepare a worker process."""
     keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
+    use_one_thread()
     threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def use_one_thread() -> None:
+    """Compute on one thread from now on: the cores are kept busy by tasks, and last bits depend on the threads."""
+    if torch.get_num_threads() != 1:
+        torch.set_num_threads(1)
+    cv2.setNumThreads(1)
 
 
 def end_with_parent() -> None:

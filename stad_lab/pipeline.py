@@ -15,13 +15,15 @@ import platform
 import shutil
 import subprocess
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from pathlib import Path
 
 import torch
 
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoencoder
-from stad_lab.checkpoints import load_json, load_tensors, save_json, save_tensors
+from stad_lab.checkpoints import load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory
@@ -31,6 +33,7 @@ from stad_lab.training import training_device
 
 STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
+MACHINE = ("python", "platform", "processor", "cores", "trained_on")
 WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", "controller.safetensors")
 
 
@@ -40,6 +43,7 @@ def train(
     folder: str | Path,
     rollouts_folder: str | Path | None = None,
     until: str = "controller",
+    executor: Executor | None = None,
 ) -> bool:
     """Run every stage up to `until` that is not finished in `folder`; run it again after an interrupt to go on.
 
@@ -48,27 +52,39 @@ def train(
         folder: of the run; made if missing.
         rollouts_folder: where the rollouts are, or go; None for `folder/rollouts`. Runs may share one.
         until: the last stage to run.
+        executor: who drives; None for `settings.processes` processes of this machine.
 
     Returns:
         False if everything was finished already and nothing was done.
 
     Raises:
-        ValueError: an unknown variant or stage, or a folder with a run of another variant or other settings.
+        ValueError: an unknown variant or stage, a folder with a run of another variant or other settings, or with a
+            file that is damaged or belongs to another run.
+        OSError: another process works in the folder, or a file cannot be read or written.
+        TaskError, FloatingPointError: as raised by the stages.
     """
     check_variant(variant)
     if until not in STAGES:
         raise ValueError(f"unknown stage {until!r}: choose one of {', '.join(STAGES)}")
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
-    record = open_record(folder, variant, settings)
     stages = {
-        "rollouts": lambda: collect_rollouts(settings, rollouts_folder),
+        "rollouts": lambda: collect_rollouts(settings, rollouts_folder, executor),
         "autoencoder": lambda: train_autoencoder(variant, settings, rollouts_folder, folder),
         "mdn_rnn": lambda: train_mdn_rnn(variant, settings, rollouts_folder, folder),
-        "controller": lambda: evolve(variant, settings, folder),
+        "controller": lambda: evolve(variant, settings, folder, executor),
     }
+    with locked(folder):
+        record = open_record(folder, variant, settings)
+        return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder)
+
+
+def run_stages(
+    stages: dict[str, Callable[[], bool]], wanted: Sequence[str], record: dict, folder: Path, rollouts_folder: Path
+) -> bool:
+    """Run the wanted stages in order and keep the record of them; False if there was nothing to do."""
     worked = False
-    for stage in STAGES[: STAGES.index(until) + 1]:
+    for stage in wanted:
         begin, did = time.perf_counter(), True  # an interrupted stage has worked too
         try:
             did = stages[stage]()
@@ -122,12 +138,20 @@ def provenance(command: str) -> dict:
         "python": platform.python_version(),
         **{package: importlib.metadata.version(package) for package in PACKAGES},
         "platform": f"{platform.system()} {platform.machine()}",
+        "processor": processor(),
         "cores": os.cpu_count(),
         "trained_on": str(training_device()),
         "commit": git("rev-parse", "HEAD"),
         "uncommitted_changes": changes if changes is None else bool(changes),
         "command": command,
     }
+
+
+def processor() -> str:
+    """The processor's name: on another one the last bits of a sum may differ, and with them a whole drive."""
+    listed = Path("/proc/cpuinfo")
+    names = listed.read_text().partition("model name")[2].partition("\n")[0] if listed.exists() else ""
+    return names.strip("\t :") or platform.processor()
 
 
 def git(*arguments: str) -> str | None:

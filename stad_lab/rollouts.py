@@ -7,10 +7,10 @@ and not kept: a dataset may be larger than the memory (at `paper` settings it ha
 """
 
 import io
+import json
 import shutil
-import time
 from collections.abc import Sequence
-from concurrent.futures import as_completed
+from concurrent.futures import Executor
 from pathlib import Path
 
 import gymnasium as gym
@@ -18,9 +18,9 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from stad_lab.car_racing import make_env, place_car
-from stad_lab.checkpoints import checksum, load_json, save_json, write_bytes
+from stad_lab.checkpoints import checksum, load_json, locked, read_bytes, save_json, write_bytes
 from stad_lab.frames import FRAME_SIZE, earlier_index, to_frame
-from stad_lab.parallel import worker_processes
+from stad_lab.parallel import run_tasks, use_one_thread, worker_processes
 from stad_lab.settings import Settings
 
 # Tracks are named by the seed of `env.reset`. The uses never share one: an agent is reported on tracks that nothing was
@@ -93,8 +93,9 @@ def begin_randomly(settings: Settings, index: int, use: str = "collect") -> tupl
 def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarray, int]:
     """Drive episode number `index`: (frames uint8 (T, 64, 64, 3), actions float32 (T, 3), track seed).
 
-    `actions[t]` is what the driver does on seeing `frames[t]`.
+    `actions[t]` is what the driver does on seeing `frames[t]`. Runs in a worker process.
     """
+    use_one_thread()
     env, observation, driver = begin_randomly(settings, index)
     frames, actions = [], []
     for _ in range(settings.episode_frames):
@@ -107,16 +108,14 @@ def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarr
     return np.array(frames), np.array(actions), track_seeds("collect", settings.episodes, settings.seed)[index]
 
 
-def collect_block(settings: Settings, index: int, folder: Path) -> dict:
-    """Drive one episode and write its block; returns the block's entry for the manifest. Runs in a worker process."""
-    frames, actions, track = drive_randomly(settings, index)
+def save_block(folder: Path, index: int, frames: np.ndarray, actions: np.ndarray, track: int) -> dict:
+    """Write an episode's block; returns its entry for the manifest."""
     entry = {"index": index, "track": track, "frames": len(frames)}
     for name, array in (("frames", frames), ("actions", actions)):
-        path = block_path(folder, index, name)
         buffer = io.BytesIO()
         np.save(buffer, array, allow_pickle=False)
-        write_bytes(path, buffer.getbuffer())
-        entry[f"{name}_sha256"] = checksum(path)
+        write_bytes(block_path(folder, index, name), buffer.getbuffer())
+        entry[f"{name}_sha256"] = checksum(buffer.getbuffer())
     return entry
 
 
@@ -125,15 +124,19 @@ def block_path(folder: Path, index: int, name: str) -> Path:
     return folder / f"{index:05d}.{name}.npy"
 
 
-def collect_rollouts(settings: Settings, folder: Path) -> bool:
+def collect_rollouts(settings: Settings, folder: Path, executor: Executor | None = None) -> bool:
     """Collect the random driver's episodes into `folder`; goes on where an earlier call stopped.
+
+    Args:
+        executor: who drives; None for `settings.processes` processes of this machine. Only this process writes.
 
     Returns:
         False if everything was there already, True if something was collected.
 
     Raises:
         ValueError: the folder holds rollouts of other settings.
-        OSError: the disk has not enough room for them.
+        OSError: the disk has not enough room for them, or another process works in the folder.
+        TaskError: an episode failed.
     """
     folder = Path(folder)
     wanted = {field: getattr(settings, field) for field in COLLECT_FIELDS}
@@ -148,17 +151,13 @@ def collect_rollouts(settings: Settings, folder: Path) -> bool:
     missing = [index for index in range(settings.episodes) if index not in done]
     if not missing:
         return False
-    folder.mkdir(parents=True, exist_ok=True)
-    check_disk(folder, len(missing) * settings.episode_frames * FRAME_BYTES)
-    for left_over in folder.glob(".*.part"):
-        if time.time() - left_over.stat().st_mtime > 60:  # a younger one may be in another run's hands
-            left_over.unlink(missing_ok=True)
-    save_json(manifest_path, manifest)
-    with worker_processes(settings.processes) as executor:
-        futures = [executor.submit(collect_block, settings, index, folder) for index in missing]
-        progress = tqdm(as_completed(futures), "collect", settings.episodes, initial=len(done), unit="episode")
-        for future in progress:
-            manifest["blocks"] = sorted([*manifest["blocks"], future.result()], key=lambda entry: entry["index"])
+    with locked(folder), worker_processes(settings.processes, executor) as executor:
+        check_disk(folder, len(missing) * settings.episode_frames * FRAME_BYTES)
+        save_json(manifest_path, manifest)
+        episodes = run_tasks(executor, drive_randomly, [(settings, index) for index in missing])
+        for number, episode in tqdm(episodes, "collect", settings.episodes, initial=len(done), unit="episode"):
+            entry = save_block(folder, missing[number], *episode)
+            manifest["blocks"] = sorted([*manifest["blocks"], entry], key=lambda entry: entry["index"])
             save_json(manifest_path, manifest)
     return True
 
@@ -201,10 +200,12 @@ class Rollouts:
     Attributes:
         frames: one uint8 array (T, 64, 64, 3) for each episode, read from the disk at every access.
         actions: one float32 array (T, 3) for each episode.
+        identity: checksum of the whole dataset; what was trained on it keeps it.
 
     Raises:
         FileNotFoundError: no manifest, or a block is missing.
         ValueError: the collection is not complete, or a block is damaged: its checksum is not the manifest's.
+        OSError: a file cannot be read.
     """
 
     def __init__(self, folder: Path):
@@ -215,10 +216,11 @@ class Rollouts:
         if found != wanted:
             raise ValueError(f"{self.folder} holds {found} of {wanted} episodes: {remedy}")
         blocks = self.manifest["blocks"]
+        self.identity = checksum(json.dumps(blocks).encode())
         for entry in blocks:
             self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
         self.frames = EpisodeFrames([block_path(self.folder, entry["index"], "frames") for entry in blocks])
-        self.actions = [self._read(entry, "actions", (entry["frames"], 3), np.float32).copy() for entry in blocks]
+        self.actions = [self._read(entry, "actions", (entry["frames"], 3), np.float32) for entry in blocks]
         lengths = [entry["frames"] for entry in blocks]
         self.episode = np.repeat(np.arange(len(lengths)), lengths)  # of every frame in the dataset
         self.moment = np.concatenate([np.arange(length) for length in lengths])  # its index in that episode
@@ -226,13 +228,12 @@ class Rollouts:
     def _read(self, entry: dict, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
         path = block_path(self.folder, entry["index"], name)
         remedy = f"delete {self.folder} and collect again"
-        if not path.is_file():
+        if not path.exists():
             raise FileNotFoundError(f"{path} is missing although the manifest lists it: {remedy}")
-        if checksum(path) != entry[f"{name}_sha256"]:
-            raise ValueError(
-                f"{path} is damaged ({path.stat().st_size} bytes, and not the checksum in the manifest): {remedy}"
-            )
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        content = read_bytes(path, remedy)
+        if checksum(content) != entry[f"{name}_sha256"]:
+            raise ValueError(f"{path} is damaged ({len(content)} bytes, not the checksum in the manifest): {remedy}")
+        array = np.load(io.BytesIO(content), allow_pickle=False)
         if array.shape != shape or array.dtype != dtype:
             raise ValueError(f"{path} holds {array.dtype} {array.shape}, the manifest says {shape}: {remedy}")
         return array

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from tqdm.auto import tqdm
 
-from stad_lab.agent import load_agent, load_world_model, run_folder
+from stad_lab.agent import WorldModel, load_agent, load_world_model, run_folder
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, kl_divergence, load_autoencoder
 from stad_lab.drives import (
     MOTION,
@@ -134,7 +134,7 @@ def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: li
     for driver, (driven, skip) in drivers.items():
         found = result["variants"][driver] = {}
         for variant in VARIANTS:
-            autoencoder, mdn_rnn, stride, crop_bar = load_world_model(run_folder(variant), variant)
+            autoencoder, mdn_rnn, stride, crop_bar, _ = load_world_model(run_folder(variant), variant)
             memories = {"z, h": mdn_rnn, "z, h of an untrained M": untrained_mdn_rnn}
             found[variant] = probe_drives(driven, skip, autoencoder, memories, stride, crop_bar)
         for name, autoencoder in untrained.items():
@@ -223,7 +223,8 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
     actions = np.array([drive.actions for drive in whole])
     result = {"whole_drives": len(whole), "horizon_steps": HORIZON, "variants": {}}
     for variant in VARIANTS:
-        autoencoder, mdn_rnn, stride, crop_bar = load_world_model(run_folder(variant), variant)
+        world_model = load_world_model(run_folder(variant), variant)
+        autoencoder, mdn_rnn, stride, crop_bar, _ = world_model
         mu, logvar = (
             np.array(part)
             for part in zip(*(encode_drive(autoencoder, drive, stride, crop_bar) for drive in whole), strict=True)
@@ -235,7 +236,7 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
         dreamed = dream_with(mdn_rnn, mu[:DREAMERS], actions[:DREAMERS], AWAKE)
         nll = {"M": mixture_nll(mixture, z), **simple_forecasts(z, actions)}
         if variant == "input":
-            nll |= lesser_forecasts(settings, rollouts_folder, work, autoencoder, z, actions)
+            nll |= lesser_forecasts(settings, rollouts_folder, work, world_model, z, actions)
         result["variants"][variant] = {
             "active": int(active.sum()),
             "nll": compare(nll, active),
@@ -288,7 +289,7 @@ def simple_forecasts(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray
 
 
 def lesser_forecasts(
-    settings: Settings, rollouts_folder: Path, work: Path, autoencoder: AutoEncoder, z: np.ndarray, actions: np.ndarray
+    settings: Settings, rollouts_folder: Path, work: Path, world_model: WorldModel, z: np.ndarray, actions: np.ndarray
 ) -> dict[str, np.ndarray]:
     """NLL of M's that lack something, trained like the whole one on the same data."""
     rollouts, encoded, result = Rollouts(rollouts_folder), None, {}
@@ -296,11 +297,12 @@ def lesser_forecasts(
         path = work / name.replace(" ", "_") / "mdn_rnn.safetensors"
         lesser = dataclasses.replace(settings, **changes)
         if not path.exists():
-            encoded = encoded or encode_rollouts(autoencoder, rollouts, settings.stride)
+            encoded = encoded or encode_rollouts(world_model.autoencoder, rollouts, settings.stride)
             torch.manual_seed(settings.seed)
             mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures)
             shown = [action * sees_actions for action in rollouts.actions]
-            fit_mdn_rnn(path, mdn_rnn, "input", encoded, shown, rollouts, lesser)
+            identity = world_model.identities["autoencoder"]
+            fit_mdn_rnn(path, mdn_rnn, "input", identity, encoded, shown, rollouts, lesser)
         mdn_rnn, _ = load_mdn_rnn(path, "input")
         if lesser.m_sequence > 1:
             result[name] = mixture_nll(forecast(mdn_rnn, z, actions * sees_actions), z)

@@ -15,6 +15,7 @@ from tqdm.auto import tqdm
 
 from stad_lab.checkpoints import load_into, load_tensors, save_tensors
 from stad_lab.parallel import keep_freed_memory, return_freed_memory
+from stad_lab.settings import check_same_run
 
 RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
@@ -36,6 +37,7 @@ def fit(
     learning_rate: float,
     checkpoint: Path,
     label: str,
+    identity: dict,
 ) -> list[dict]:
     """Train `model` in place for `steps` steps, or for those left after the checkpoint.
 
@@ -46,17 +48,19 @@ def fit(
         learning_rate: Adam's rate at the start; it falls to a tenth of it along a cosine.
         checkpoint: file of the training state, read if it exists, written with every entry of the history.
         label: what the progress bar says.
+        identity: settings and checksums of all that the training depends on; a checkpoint of another one is refused.
 
     Returns:
         The history: entries {"step", "train": means since the last entry, "heldout"}, a twentieth of the run apart.
 
     Raises:
-        ValueError: the checkpoint belongs to another model or is damaged.
+        ValueError: the checkpoint belongs to another training or is damaged.
         FloatingPointError: the loss is not finite.
+        OSError: the checkpoint cannot be written; the one before it is whole.
     """
     keep_freed_memory()
     optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate, fused=True)  # one pass over the weights, not ten
-    history = load_state(checkpoint, model, optimizer) if checkpoint.exists() else []
+    history = load_state(checkpoint, model, optimizer, identity) if checkpoint.exists() else []
     start, sums = history[-1]["step"] if history else 0, {}
     every = max(1, steps // RECORDS)
     step = start
@@ -68,7 +72,8 @@ def fit(
             found = losses(*present)
             if not torch.isfinite(found["total"]):
                 raise FloatingPointError(
-                    f"{label}: the loss is {found['total'].item()} in step {step}: lower the learning rate"
+                    f"{label}: the loss is {found['total'].item()} in step {step}: lower the learning rate, in a new"
+                    " folder"
                 )
             optimizer.zero_grad(set_to_none=True)
             found["total"].backward()
@@ -83,7 +88,7 @@ def fit(
                 history.append({"step": step + 1, "train": means, "heldout": heldout_losses()})
                 sums = {}
                 progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
-                save_state(checkpoint, model, optimizer, history)
+                save_state(checkpoint, model, optimizer, history, identity)
     except KeyboardInterrupt:
         # The interrupt may have come in mid-update; the checkpoint of the last record is whole, so it stays.
         print(f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint")
@@ -100,17 +105,24 @@ def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[in
             yield step, present.result()
 
 
-def save_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, history: list) -> None:
+def save_state(
+    path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, history: list, identity: dict
+) -> None:
     """Write everything the next step depends on: weights, Adam's moments, and the history, which says where we are."""
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
     for number, moments in optimizer.state_dict()["state"].items():
         tensors |= {f"adam.{number}.{name}": tensor for name, tensor in moments.items()}
-    save_tensors(path, tensors, history=history)
+    save_tensors(path, tensors, history=history, identity=identity)
 
 
-def load_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer) -> list:
-    """Restore what `save_state` wrote into `model` and `optimizer`; returns the history."""
-    tensors, facts = load_tensors(path, "run the same command again, from the start")
+def load_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, identity: dict) -> list:
+    """Restore what `save_state` wrote into `model` and `optimizer`; returns the history.
+
+    Raises:
+        ValueError: the file is damaged, or of a training of another identity.
+    """
+    tensors, facts = load_tensors(path, "run the same command again, which trains this part from its start")
+    check_same_run(path, facts["identity"], identity)
     weights = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith("model.")}
     load_into(model, weights, path)
     state, parameters = optimizer.state_dict(), list(model.parameters())

@@ -262,7 +262,7 @@ def test_weights_that_stad_lab_did_not_write_are_refused(quick_run, tmp_path):
 def test_a_controller_is_read_as_it_was_written(tmp_path):
     parameters = np.random.default_rng(0).standard_normal(867)
     save_controller(tmp_path / "c.safetensors", parameters, variant="input")
-    assert np.array_equal(load_controller(tmp_path / "c.safetensors", "input"), parameters)
+    assert np.array_equal(load_controller(tmp_path / "c.safetensors", "input")[0], parameters)
     with pytest.raises(ValueError, match="holds variant 'input', and 'frame' was asked for: give its own run"):
         load_controller(tmp_path / "c.safetensors", "frame")
 

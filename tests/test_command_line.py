@@ -133,7 +133,7 @@ def test_until_stops_after_a_stage_and_set_changes_a_setting(tmp_path, capsys):
     arguments += ["--set", "episodes=2", "--set", "crop_bar=false", "--set", "kl_weight=0.5"]
     assert main([str(argument) for argument in arguments]) == 0
     assert "rollouts: done" in capsys.readouterr().out
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["record.json", "rollouts"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "record.json", "rollouts"]
     settings = json.loads((tmp_path / "record.json").read_text())["settings"]
     changes = {"stride": 2, "episodes": 2, "crop_bar": False, "kl_weight": 0.5}
     assert Settings.from_dict(settings) == Settings.preset("quick", **changes)
@@ -286,7 +286,7 @@ def test_a_rollout_file_cut_short_ends_in_one_clear_line(run, capsys):
     block.write_bytes(block.read_bytes()[:2000])
     (run / "autoencoder.safetensors").unlink()
     error = the_error(capsys, train_quickly(run))
-    assert f"{block} is damaged (2000 bytes, and not the checksum in the manifest): delete" in error
+    assert f"{block} is damaged (2000 bytes, not the checksum in the manifest): delete" in error
     assert "collect again" in error
 
 

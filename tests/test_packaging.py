@@ -29,6 +29,8 @@ ROOMS = [
     "evolution",
     "evaluation",
     "pipeline",
+    "verify",
+    "cluster",
     "study",
     "benchmark",
     "plots",

@@ -1,0 +1,82 @@
+"""Beyond one machine: the workers of a Dask cluster in place of this machine's own processes.
+
+Collecting, evolving and evaluating take any `concurrent.futures.Executor`, and this is Dask's. Episodes depend on their
+seeds alone, so a cluster changes how long a run takes and nothing else (on other processors the last bits, as ever).
+"""
+
+import importlib.metadata
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from distributed import Client, Future
+from distributed.cfexecutor import ClientExecutor
+
+PATIENCE = 60.0  # seconds to wait for a scheduler to answer and for its first worker
+SAME = ("stad_lab", "torch", "numpy", "gymnasium", "box2d", "opencv-python-headless")  # or the numbers would differ
+
+
+class ClusterExecutor(ClientExecutor):
+    """Dask's executor, which does the work of a lost worker again; and with a way to share something large."""
+
+    def share(self, value: Any) -> Future:
+        """A stand-in for `value` in the arguments of tasks: every worker that needs it gets it once.
+
+        It is the result of a task, not data that was put there, so it comes back if the workers that held it are lost.
+        """
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Sending large graph")  # once for each run, not for each task
+            return self._client.submit(itself, value, pure=False)
+
+
+def itself(value: Any) -> Any:
+    """What it is given."""
+    return value
+
+
+@contextmanager
+def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecutor]:
+    """The workers of the Dask scheduler at `address`, as an executor, for a `with` block.
+
+    Args:
+        address: for example "tcp://10.0.0.1:8786", as `dask scheduler` prints it.
+        patience: seconds to wait for it, and for a worker.
+
+    Raises:
+        OSError: no scheduler answers, or it has no worker.
+        ValueError: a worker has other versions than this process, and so would drive otherwise.
+    """
+    try:
+        client = Client(address, timeout=patience, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise ConnectionError(
+            f"no Dask scheduler answers at {address!r} ({error}): start one with `dask scheduler`, and give the address"
+            " that it prints"
+        ) from error
+    with client:
+        try:
+            client.wait_for_workers(1, timeout=patience)
+        except TimeoutError as error:
+            raise ConnectionError(
+                f"the scheduler at {address} has no worker after {patience:.0f} seconds: start one with"
+                f" `dask worker {address} --nthreads 1`"
+            ) from error
+        check_versions(client.run(versions))
+        yield ClusterExecutor(client, pure=False)
+
+
+def versions() -> dict[str, str]:
+    """The versions on which the numbers depend, as they are in this process."""
+    return {package: importlib.metadata.version(package) for package in SAME}
+
+
+def check_versions(found: dict[str, dict[str, str]]) -> None:
+    """Raise ValueError unless every worker, by its address, has the versions of this process."""
+    for worker, theirs in found.items():
+        for package, ours in versions().items():
+            if theirs[package] != ours:
+                raise ValueError(
+                    f"worker {worker} has {package} {theirs[package]}, here it is {ours}: install the same"
+                    " environment.txt on all machines"
+                )

@@ -1,0 +1,162 @@
+"""Verify a run: are its files what they were, do they belong together, and does its car still drive the same way?
+
+The same seed, settings, versions and processor give equal bits in every stage. So a recorded episode can be driven
+again to the same return, and a log of CMA-ES can be told again to the same mean.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from stad_lab.agent import load_controller, read_world_model
+from stad_lab.autoencoder import check_facts, load_autoencoder
+from stad_lab.checkpoints import checksum, load_json
+from stad_lab.controller import initial_parameters
+from stad_lab.evolution import CONTROLLER, LOG, drive_group, kept_generation, read_log, replay, validate
+from stad_lab.mdn_rnn import load_mdn_rnn
+from stad_lab.parallel import run_tasks, worker_processes
+from stad_lab.pipeline import MACHINE, PACKAGES, provenance
+from stad_lab.rollouts import Rollouts
+from stad_lab.settings import Settings
+
+AGAIN = 3  # recorded episodes that are driven again
+NOT_HERE = "trained elsewhere or not yet"
+
+
+def verify(folder: str | Path) -> dict[str, str]:
+    """Check every file of the run in `folder`, and drive three of its recorded episodes again; about a minute.
+
+    Returns:
+        What was checked -> what was found. It begins with "ok" if all is well, "FAILED" if not, "none" if there is
+        nothing to check, and "differs" if another machine than that of the record has driven otherwise, as it may.
+
+    Raises:
+        FileNotFoundError: no run in the folder, since it has no record.
+        ValueError: the record itself is damaged.
+    """
+    folder = Path(folder)
+    record = load_json(folder / "record.json", "give the folder of a run, as `python -m stad_lab train --out` makes it")
+    variant, settings = record["variant"], Settings.from_dict(record["settings"])
+    checks: dict[str, Callable[[], str]] = {
+        "record": lambda: f"ok: {variant}, {settings.name} settings",
+        "rollouts": lambda: verify_rollouts(folder / "rollouts"),
+        "V": lambda: verify_autoencoder(folder, variant, settings),
+        "M": lambda: verify_mdn_rnn(folder, variant, settings),
+        "log of CMA-ES": lambda: verify_log(folder, variant, settings),
+        "C": lambda: verify_controller(folder, variant, settings),
+        "evaluations": lambda: verify_evaluations(folder),
+        "drives": lambda: drive_again(folder, variant, settings),
+    }
+    return {name: outcome(check, other_machine(record["made_with"])) for name, check in checks.items()}
+
+
+class NotRepeated(ValueError):
+    """The same again gave something else, which is a fault only on the same machine."""
+
+
+def outcome(check: Callable[[], str], excuse: str) -> str:
+    """What a check says; an error that it raises is a failure, or has an excuse."""
+    try:
+        return check()
+    except NotRepeated as error:
+        return f"differs: {error}; but {excuse}" if excuse else f"FAILED: {error}"
+    except (ValueError, OSError) as error:
+        return f"FAILED: {error}"
+
+
+def other_machine(made_with: dict) -> str:
+    """In what this machine differs from that of the record; nothing if it is the same."""
+    here = provenance("")
+    return ", ".join(
+        f"{name} is {here[name]!r} and was {made_with.get(name, 'not recorded')!r}"
+        for name in (*MACHINE, *PACKAGES)
+        if here[name] != made_with.get(name)
+    )
+
+
+def verify_rollouts(folder: Path) -> str:
+    """Check every block against the manifest."""
+    if not folder.is_dir():
+        return f"none: {NOT_HERE}"
+    rollouts = Rollouts(folder)
+    return f"ok: {len(rollouts.frames)} episodes, {len(rollouts)} frames"
+
+
+def verify_autoencoder(folder: Path, variant: str, settings: Settings) -> str:
+    """Check V, its settings, and that it has seen these rollouts."""
+    path = folder / "autoencoder.safetensors"
+    if not path.exists():
+        return f"none: {NOT_HERE}"
+    _, facts = load_autoencoder(path, variant)
+    check_facts(path, facts, settings)
+    if (folder / "rollouts").is_dir() and facts["rollouts"] not in (None, Rollouts(folder / "rollouts").identity):
+        raise ValueError(f"{path} was trained on other rollouts than those in {folder / 'rollouts'}")
+    return "ok"
+
+
+def verify_mdn_rnn(folder: Path, variant: str, settings: Settings) -> str:
+    """Check M, its settings, and that it belongs to V."""
+    path = folder / "mdn_rnn.safetensors"
+    if not path.exists():
+        return f"none: {NOT_HERE}"
+    check_facts(path, load_mdn_rnn(path, variant)[1], settings)
+    read_world_model(folder, variant)
+    return "ok"
+
+
+def verify_log(folder: Path, variant: str, settings: Settings) -> str:
+    """Tell CMA-ES every logged generation again: it must come to the logged means."""
+    if not (folder / LOG).exists():
+        return f"none: {NOT_HERE}"
+    world_model = read_world_model(folder, variant)
+    log = read_log(variant, settings, folder, world_model)
+    sizes = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
+    try:
+        replay(initial_parameters(*sizes, settings.initial_gas), settings, log["generations"])
+    except ValueError as error:
+        raise NotRepeated(error) from error
+    return f"ok: {len(log['generations'])} generations lead to the same mean"
+
+
+def verify_controller(folder: Path, variant: str, settings: Settings) -> str:
+    """Check that C is the mean that the log calls the best."""
+    if not (folder / CONTROLLER).exists():
+        return f"none: {NOT_HERE}"
+    log = read_log(variant, settings, folder, read_world_model(folder, variant))
+    kept, best = kept_generation(variant, folder, log), log["best"]
+    if best is None or kept != best["generation"]:
+        raise ValueError(f"{folder / CONTROLLER} is the mean of generation {kept}, the log calls {best} the best")
+    return f"ok: mean of generation {kept}"
+
+
+def verify_evaluations(folder: Path) -> str:
+    """Check the files of `evaluate`, and that they are about this C."""
+    files = sorted(folder.glob("evaluation*.json"))
+    for file in files:
+        if load_json(file, "evaluate again")["controller_sha256"] != checksum((folder / CONTROLLER).read_bytes()):
+            raise ValueError(f"{file} tells of another controller than {folder / CONTROLLER}: evaluate again")
+    return f"ok: {', '.join(file.name for file in files)}" if files else "none: not evaluated in this folder"
+
+
+def drive_again(folder: Path, variant: str, settings: Settings) -> str:
+    """Drive recorded episodes again: those of an evaluation, or else of the last look at the validation tracks."""
+    if not (folder / CONTROLLER).exists():
+        return f"none: {NOT_HERE}"
+    parameters, facts = load_controller(folder / CONTROLLER, variant)
+    evaluations = [load_json(file) for file in sorted(folder.glob("evaluation*.json"))]
+    with worker_processes(settings.processes) as executor:
+        if evaluations:
+            episodes, fast = evaluations[0]["episodes"], evaluations[0]["renderer"] == "fast"
+            chosen = [episodes[n] for n in np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)]
+            recorded = [episode["return"] for episode in chosen]
+            tasks = [(folder, variant, parameters, [episode["track"]], fast, None) for episode in chosen]
+            found = dict(run_tasks(executor, drive_group, tasks))
+            driven = [float(found[n][0][0]) for n in range(len(tasks))]
+        else:  # all the tracks, because last bits depend on the cars that drive in step
+            looks = load_json(folder / LOG)["generations"][facts["generation"] - 1]
+            recorded = looks["validation"]["returns"][:AGAIN]
+            driven = validate(executor, folder, variant, settings, parameters)["returns"][:AGAIN]
+    if driven != recorded:
+        raise NotRepeated(f"the record says {recorded}, now it was {driven}")
+    return f"ok: {', '.join(f'{value:.1f}' for value in driven)} points, to the last bit as recorded"
