@@ -63,13 +63,18 @@ def write_bytes(path: Path, content: bytes) -> None:
         temporary.replace(path)
         sync_folder(path.parent)
     except OSError as error:
-        raise OSError(
-            f"{path} could not be written ({error.strerror}): see to free room and to the right to write there;"
-            " what was in it before is unchanged"
-        ) from error
+        raise unwritable(path, error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def unwritable(path: Path, error: OSError) -> OSError:
+    """The error for a file that the system does not let us write."""
+    return OSError(
+        f"{path} could not be written ({error.strerror}): see to free room and to the right to write there; what was in"
+        " it before is unchanged"
+    )
 
 
 def sync_folder(folder: Path) -> None:
@@ -86,8 +91,13 @@ def check_writable(path: Path) -> None:
     """Raise OSError, before any work, if the file `path` could not be written at its end."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give the name of a file")
-    write_bytes(path.with_name(f".{path.name}.trial.part"), b"")
-    path.with_name(f".{path.name}.trial.part").unlink()
+    trial = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        trial.touch()
+        trial.unlink()
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
 def read_bytes(path: Path, remedy: str) -> bytes:

@@ -108,7 +108,8 @@ def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldM
     if not (folder / LOG).exists():
         return new | {"generations": []}
     log = load_json(folder / LOG, "evolve C again")
-    check_same_run(folder, {"variant": log["variant"], **log["settings"]}, {"variant": variant, **new["settings"]})
+    made = {"variant": log["variant"], **log["settings"]}
+    check_same_run(folder / LOG, made, {"variant": variant, **new["settings"]})
     check_partner(folder / LOG, log, **world_model.identities)
     return log | {"settings": new["settings"]}
 

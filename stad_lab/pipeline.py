@@ -88,6 +88,9 @@ def run_stages(
         begin, did = time.perf_counter(), True  # an interrupted stage has worked too
         try:
             did = stages[stage]()
+        except (ValueError, OSError):  # refused: what is in the folder stays as it is
+            did = False
+            raise
         finally:
             if did:
                 record["seconds"][stage] = record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
@@ -119,7 +122,7 @@ def open_record(folder: Path, variant: str, settings: Settings) -> dict:
         return record
     record = load_json(path)
     check_same_run(
-        folder, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
+        path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
     )
     return record | {"settings": settings.as_dict()}
 

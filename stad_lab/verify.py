@@ -5,6 +5,7 @@ again to the same return, and a log of CMA-ES can be told again to the same mean
 """
 
 from collections.abc import Callable
+from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +25,11 @@ AGAIN = 3  # recorded episodes that are driven again
 NOT_HERE = "trained elsewhere or not yet"
 
 
-def verify(folder: str | Path) -> dict[str, str]:
+def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, str]:
     """Check every file of the run in `folder`, and drive three of its recorded episodes again; about a minute.
+
+    Args:
+        executor: who drives; None for processes of this machine.
 
     Returns:
         What was checked -> what was found. It begins with "ok" if all is well, "FAILED" if not, "none" if there is
@@ -46,7 +50,7 @@ def verify(folder: str | Path) -> dict[str, str]:
         "log of CMA-ES": lambda: verify_log(folder, variant, settings),
         "C": lambda: verify_controller(folder, variant, settings),
         "evaluations": lambda: verify_evaluations(folder),
-        "drives": lambda: drive_again(folder, variant, settings),
+        "drives": lambda: drive_again(folder, variant, settings, executor),
     }
     return {name: outcome(check, other_machine(record["made_with"])) for name, check in checks.items()}
 
@@ -139,13 +143,13 @@ def verify_evaluations(folder: Path) -> str:
     return f"ok: {', '.join(file.name for file in files)}" if files else "none: not evaluated in this folder"
 
 
-def drive_again(folder: Path, variant: str, settings: Settings) -> str:
+def drive_again(folder: Path, variant: str, settings: Settings, executor: Executor | None) -> str:
     """Drive recorded episodes again: those of an evaluation, or else of the last look at the validation tracks."""
     if not (folder / CONTROLLER).exists():
         return f"none: {NOT_HERE}"
     parameters, facts = load_controller(folder / CONTROLLER, variant)
     evaluations = [load_json(file) for file in sorted(folder.glob("evaluation*.json"))]
-    with worker_processes(settings.processes) as executor:
+    with worker_processes(settings.processes, executor) as executor:
         if evaluations:
             episodes, fast = evaluations[0]["episodes"], evaluations[0]["renderer"] == "fast"
             chosen = [episodes[n] for n in np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)]

@@ -19,10 +19,32 @@ from stad_lab import load_agent, make_env
 torch.set_num_threads(1)  # the models here are tiny: more threads would only get in each other's way
 
 
-def run_stad_lab(*arguments):
+def run_stad_lab(*arguments, **environment):
     """Run the real command line in a process of its own."""
     command = [sys.executable, "-m", "stad_lab", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=os.environ | environment)
+
+
+# Python runs a module of this name at every start, so this watches the command and all of its workers.
+GUARD = """
+import os, sys
+
+def guard(event, arguments):
+    if event in ("socket.connect", "socket.bind", "socket.getaddrinfo"):
+        forbid(f"{event} {arguments}")
+    if event == "open" and isinstance(arguments[0], str) and arguments[2] is not None:
+        where = os.path.abspath(arguments[0])
+        writes, allowed = arguments[2] & (os.O_WRONLY | os.O_RDWR), os.environ["GUARDED"].split(":")
+        if writes and not where.startswith(tuple(allowed)):
+            forbid(f"writing to {where}")
+
+def forbid(what):
+    print("forbidden:", what, file=sys.stderr)
+    raise PermissionError(what)
+
+sys.addaudithook(guard)
+print("guarded", file=sys.stderr)
+"""
 
 
 @pytest.fixture(scope="session")
@@ -35,8 +57,12 @@ def command_line():
 def quick_training(tmp_path_factory):
     """One run made by the real command: (its folder, the finished process, its duration in seconds)."""
     folder = tmp_path_factory.mktemp("runs") / "quick"
+    guard = tmp_path_factory.mktemp("guard")
+    (guard / "sitecustomize.py").write_text(GUARD)
+    may_write = f"{folder}:{guard}:/dev/:/proc/"  # PyTorch looks for a place for temporary files
+    guarded = {"GUARDED": may_write, "TMPDIR": str(guard), "PYTHONPATH": str(guard), "PYTHONDONTWRITEBYTECODE": "1"}
     begin = time.perf_counter()
-    process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder)
+    process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded)
     assert process.returncode == 0, process.stderr
     return folder, process, time.perf_counter() - begin
 

@@ -1,0 +1,153 @@
+"""Beyond one machine: a real Dask scheduler and four workers, processes of their own with their own addresses."""
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from distributed import Client
+from test_faults import VARIANT, assert_equal_results, start_of
+
+from stad_lab.__main__ import main
+from stad_lab.checkpoints import load_json
+from stad_lab.cluster import check_versions, cluster, versions
+from stad_lab.evaluation import evaluate
+from stad_lab.evolution import evolve
+from stad_lab.rollouts import collect_rollouts
+from stad_lab.settings import Settings
+
+WORKERS = 4
+SETTINGS = Settings.preset("quick")
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory):
+    """Its address, and the processes of its workers by their names."""
+    folder, quiet = tmp_path_factory.mktemp("cluster"), {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet["env"] = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}  # for the tasks that are written here
+    dask, contact = [sys.executable, "-m", "dask"], folder / "scheduler.json"
+    options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
+    processes = [subprocess.Popen([*dask, "scheduler", *options, "--scheduler-file", contact], cwd=folder, **quiet)]
+    wait_for(contact.exists)
+    time.sleep(0.5)
+    address = load_address(contact)
+    options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1", "--local-directory", folder]
+    workers = {
+        f"worker{number}": subprocess.Popen(
+            [*dask, "worker", address, "--name", f"worker{number}", *options], cwd=folder, **quiet
+        )
+        for number in range(WORKERS)
+    }
+    with Client(address, set_as_default=False) as client:
+        client.wait_for_workers(WORKERS, timeout=120)
+    yield address, workers
+    for process in [*workers.values(), *processes]:
+        process.kill()
+        process.wait()
+
+
+def load_address(contact):
+    """The address in a scheduler's contact file, which Dask writes (so it has no checksum of ours)."""
+    return json.loads(contact.read_text())["address"]
+
+
+def wait_for(condition, seconds=60):
+    """Wait until a condition holds."""
+    deadline = time.time() + seconds
+    while not condition():
+        assert time.time() < deadline
+        time.sleep(0.05)
+
+
+class Parcel:
+    """Something to share that counts in every process how often it has arrived."""
+
+    arrived = 0
+
+    def __getstate__(self):
+        return {"content": bytes(1000)}
+
+    def __setstate__(self, state):
+        type(self).arrived += 1
+
+
+def open_parcel(parcel, number):
+    """A task: where it ran, and how many parcels have arrived there."""
+    time.sleep(0.05)
+    return os.getpid(), type(parcel).arrived
+
+
+def test_what_is_shared_travels_once_to_every_worker_and_not_with_each_task(scheduler):
+    with cluster(scheduler[0]) as executor:
+        parcel = executor.share(Parcel())
+        found = [future.result() for future in [executor.submit(open_parcel, parcel, number) for number in range(40)]]
+    assert len({process for process, _ in found}) == WORKERS
+    assert max(arrived for _, arrived in found) == 1
+
+
+def test_a_collection_on_a_cluster_is_the_same_to_the_last_bit(scheduler, quick_run, tmp_path):
+    with cluster(scheduler[0]) as executor:
+        collect_rollouts(SETTINGS, tmp_path / "run" / "rollouts", executor)
+    for path in (quick_run / "rollouts").glob("*.*"):
+        assert (tmp_path / "run" / "rollouts" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_an_evaluation_on_a_cluster_is_the_same_to_the_last_bit(scheduler, quick_run):
+    with cluster(scheduler[0]) as executor:
+        far = evaluate(VARIANT, quick_run, 3, fast=True, executor=executor)
+    with ThreadPoolExecutor(2) as executor:
+        near = evaluate(VARIANT, quick_run, 3, fast=True, executor=executor)
+    assert far["episodes"] == near["episodes"]
+
+
+def test_the_command_line_evolves_on_a_cluster(scheduler, quick_run, tmp_path, capsys):
+    folder = start_of("controller", quick_run, tmp_path / "run")
+    command = ["train", "--variant", VARIANT, "--settings", "quick", "--scheduler", scheduler[0], "--out", str(folder)]
+    assert main(command) == 0
+    assert_equal_results(folder, quick_run, "controller")
+
+
+def test_a_worker_killed_in_mid_generation_costs_a_retry_and_not_the_run(scheduler, quick_run, tmp_path):
+    address, workers = scheduler
+    folder = start_of("controller", quick_run, tmp_path / "run")
+    with cluster(address) as executor:
+
+        def kill_one():
+            wait_for(lambda: busy(executor) and (folder / "evolution.json").exists())
+            name = next(iter(busy(executor)))
+            workers[name].kill()
+            killed.append(name)
+
+        killed = []
+        killer = threading.Thread(target=kill_one)
+        killer.start()
+        evolve(VARIANT, SETTINGS, folder, executor)
+        killer.join()
+        wait_for(lambda: len(executor._client.scheduler_info()["workers"]) == WORKERS - 1)
+    assert len(killed) == 1
+    assert len(load_json(folder / "evolution.json")["generations"]) == SETTINGS.generations
+    assert_equal_results(folder, quick_run, "controller")
+
+
+def busy(executor):
+    """The names of the workers that have a task."""
+    names = {address: worker["name"] for address, worker in executor._client.scheduler_info()["workers"].items()}
+    return [names[address] for address, tasks in executor._client.processing().items() if tasks and address in names]
+
+
+def test_an_address_without_a_scheduler_is_an_error_that_says_how_to_start_one():
+    with (
+        pytest.raises(OSError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"),
+        cluster("tcp://127.0.0.1:9", patience=1),
+    ):
+        pass
+
+
+def test_a_worker_with_other_versions_is_refused():
+    with pytest.raises(ValueError, match=r"worker tcp://far has torch 1.0, here it is .*install the same"):
+        check_versions({"tcp://near": versions(), "tcp://far": versions() | {"torch": "1.0"}})

@@ -1,0 +1,476 @@
+"""Broken files, broken machines and impatient people: nothing is lost, nothing is used that is not whole."""
+
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+
+import pytest
+from torch.optim.optimizer import register_optimizer_step_post_hook
+
+from stad_lab import evolution
+from stad_lab.__main__ import main
+from stad_lab.agent import load_agent
+from stad_lab.autoencoder import train_autoencoder
+from stad_lab.checkpoints import load_json, load_tensors, save_json, write_bytes
+from stad_lab.evaluation import evaluate
+from stad_lab.evolution import evolve
+from stad_lab.mdn_rnn import train_mdn_rnn
+from stad_lab.parallel import TaskError, run_tasks, worker_processes
+from stad_lab.pipeline import STAGES, train
+from stad_lab.rollouts import Rollouts
+from stad_lab.settings import Settings
+from stad_lab.verify import verify
+
+VARIANT, SETTINGS = "input_output", Settings.preset("quick")
+CHECKPOINTS = ("autoencoder.training.safetensors", "mdn_rnn.training.safetensors")
+
+
+@pytest.fixture(scope="module")
+def in_this_process():
+    """An executor without processes: any one serves."""
+    with ThreadPoolExecutor(1) as executor:
+        yield executor
+
+
+# Broken files
+
+
+@pytest.fixture(scope="module")
+def whole(quick_run, tmp_path_factory, in_this_process):
+    """A finished run with an evaluation, and the checkpoints of trainings that were interrupted half way."""
+    folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("faults") / "whole")
+    save_json(folder / "evaluation.json", evaluate(VARIANT, folder, 1, fast=True, executor=in_this_process))
+    add_checkpoints(folder, SETTINGS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def another(tmp_path_factory, in_this_process):
+    """A run of another seed, with checkpoints too."""
+    folder, settings = tmp_path_factory.mktemp("faults") / "another", Settings.preset("quick", seed=1)
+    train(VARIANT, settings, folder, executor=in_this_process)
+    save_json(folder / "evaluation.json", evaluate(VARIANT, folder, 1, fast=True, executor=in_this_process))
+    add_checkpoints(folder, settings)
+    return folder
+
+
+def add_checkpoints(folder, settings):
+    """Interrupt a training of V and one of M after ten steps, and keep their checkpoints beside the finished run."""
+    trainings = {"autoencoder": train_autoencoder, "mdn_rnn": train_mdn_rnn}
+    for part, again in trainings.items():
+        finished, content = folder / f"{part}.safetensors", (folder / f"{part}.safetensors").read_bytes()
+        finished.unlink()
+        left = [10]
+
+        def interrupt(*_, left=left):
+            left[0] -= 1
+            if left[0] == 0:
+                raise KeyboardInterrupt
+
+        hook = register_optimizer_step_post_hook(interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            again(VARIANT, settings, folder / "rollouts", folder)
+        hook.remove()
+        finished.write_bytes(content)
+
+
+def resume_training(part):
+    """Go on with an interrupted training of V or M: what is read is the checkpoint."""
+
+    def resume(folder):
+        (folder / f"{part}.safetensors").unlink()
+        {"autoencoder": train_autoencoder, "mdn_rnn": train_mdn_rnn}[part](
+            VARIANT, SETTINGS, folder / "rollouts", folder
+        )
+
+    return resume
+
+
+READERS = {
+    "rollouts/manifest.json": [lambda folder: Rollouts(folder / "rollouts")],
+    "rollouts/00003.frames.npy": [lambda folder: Rollouts(folder / "rollouts")],
+    "rollouts/00005.actions.npy": [lambda folder: Rollouts(folder / "rollouts")],
+    "autoencoder.safetensors": [
+        lambda folder: load_agent(VARIANT, folder),
+        lambda folder: evolve(VARIANT, SETTINGS, folder),
+    ],
+    "mdn_rnn.safetensors": [
+        lambda folder: load_agent(VARIANT, folder),
+        lambda folder: train(VARIANT, SETTINGS, folder),
+    ],
+    "controller.safetensors": [
+        lambda folder: load_agent(VARIANT, folder),
+        lambda folder: train(VARIANT, SETTINGS, folder),
+    ],
+    "evolution.json": [lambda folder: evolve(VARIANT, SETTINGS, folder)],
+    "record.json": [lambda folder: train(VARIANT, SETTINGS, folder)],
+    "evaluation.json": [lambda folder: load_json(folder / "evaluation.json")],
+    "autoencoder.training.safetensors": [resume_training("autoencoder")],
+    "mdn_rnn.training.safetensors": [resume_training("mdn_rnn")],
+}
+ROUNDS = 12  # of truncations and of flipped bits, for each file
+
+
+def damages(content, rng):
+    """Broken versions of a file's content, each with a name; None stands for a folder in the file's place."""
+    for _ in range(ROUNDS):
+        length = rng.randrange(1, len(content))
+        yield f"cut to {length} bytes", content[:length]
+        # Half of the bits near the beginning, where headers are: a flip in a million weights is the easy case.
+        place = rng.randrange(min(len(content), 2000) if rng.random() < 0.5 else len(content))
+        flipped = bytes([content[place] ^ (1 << rng.randrange(8))])
+        yield f"bit of byte {place} flipped", content[:place] + flipped + content[place + 1 :]
+    yield "emptied", b""
+    yield "a folder in its place", None
+
+
+def says_the_same(path, content):
+    """Whether a changed file still says what it said: a flipped bit may turn one blank into another kind of blank."""
+    damaged = path.read_bytes()
+    try:
+        now = load_json(path) if path.suffix == ".json" else load_tensors(path)
+        path.write_bytes(content)
+        was = load_json(path) if path.suffix == ".json" else load_tensors(path)
+    except ValueError:
+        return False
+    finally:
+        path.write_bytes(damaged)
+    return str(now) == str(was)
+
+
+def put(path, content):
+    """Put a content in a file's place; None stands for a folder."""
+    if path.is_dir():
+        path.rmdir()
+    if content is None:
+        path.unlink(missing_ok=True)
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+
+
+def snapshot(folder):
+    """All files of a run and what is in them, but for hidden ones."""
+    paths = [path for path in folder.rglob("*") if not path.name.startswith(".")]
+    return {path: path.read_bytes() if path.is_file() else None for path in paths}
+
+
+def assert_refused(read, folder, name, what):
+    """Reading ends in one clear error that names a file of the run and a remedy, and changes nothing."""
+    before = snapshot(folder)
+    with pytest.raises((ValueError, OSError)) as caught:
+        read(folder)
+    message = str(caught.value)
+    assert re.search(r"\.(json|npy|safetensors)", message), (name, what, message)
+    assert str(folder) in message, (name, what, message)
+    remedy = r"delete|make it readable|give |choose|move it away|evolve C again|train|collect"
+    assert re.search(remedy, message), (name, what, message)
+    after = snapshot(folder)
+    removed = {path for path in before if path not in after}
+    assert removed <= {folder / "autoencoder.safetensors", folder / "mdn_rnn.safetensors"}  # by resume_training itself
+    assert all(after[path] == before[path] for path in after), (name, what)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_damaged_file_is_refused_before_use_and_stays_as_it_is(name, whole, tmp_path):
+    folder, refused = shutil.copytree(whole, tmp_path / "run"), 0
+    if not name.startswith(CHECKPOINTS):
+        for checkpoint in CHECKPOINTS:
+            (folder / checkpoint).unlink()
+    content, rng = (folder / name).read_bytes(), random.Random(name)
+    for what, damaged in damages(content, rng):
+        for read in READERS[name]:
+            put(folder / name, damaged)
+            if damaged and not name.endswith(".npy") and says_the_same(folder / name, content):
+                continue
+            assert_refused(read, folder, name, what)
+            refused += 1
+            for part in ("autoencoder.safetensors", "mdn_rnn.safetensors"):
+                if not (folder / part).exists():
+                    shutil.copy(whole / part, folder / part)
+    assert refused >= 2 * ROUNDS - 4  # 11 files: more than 220 cases
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_a_file_of_another_run_is_refused_before_use(name, whole, another, tmp_path, in_this_process):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    shutil.copy(another / name, folder / name)
+    if name == "evaluation.json":
+        assert verify(folder, in_this_process)["evaluations"].startswith(f"FAILED: {folder / name} tells of another")
+        return
+    for read in READERS[name]:
+        assert_refused(read, folder, name, "of another run")
+        for part in ("autoencoder.safetensors", "mdn_rnn.safetensors"):
+            if not (folder / part).exists():
+                shutil.copy(whole / part, folder / part)
+
+
+@pytest.mark.skipif(os.name == "nt" or os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_may_not_be_read_is_an_error_that_says_so(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    (folder / "mdn_rnn.safetensors").chmod(0)
+    with pytest.raises(OSError, match=r"mdn_rnn.safetensors cannot be read .*: make it readable"):
+        load_agent(VARIANT, folder)
+
+
+# Killed processes
+
+
+def stage_command(folder, stage):
+    """The command that runs everything up to a stage."""
+    command = [sys.executable, "-m", "stad_lab", "train", "--variant", VARIANT, "--settings", "quick"]
+    return [*command, "--out", str(folder), "--until", stage]
+
+
+def start_of(stage, run, folder):
+    """A copy of a finished run in which the stage has not begun."""
+    results = ("rollouts", "autoencoder.safetensors", "mdn_rnn.safetensors", "evolution.json", "controller.safetensors")
+    return shutil.copytree(run, folder, ignore=shutil.ignore_patterns(*results[STAGES.index(stage) :], "*.training.*"))
+
+
+def kill_at_random(stage, run, tmp_path, kills):
+    """Kill a stage at random moments, again and again, until it has been killed `kills` times; then let it end."""
+    rng, killed, folder = random.Random(stage), 0, start_of(stage, run, tmp_path / "run0")
+    duration = load_json(run / "record.json")["seconds"][stage]
+    while killed < kills:
+        process = subprocess.Popen(stage_command(folder, stage), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        before = STAGES.index(stage)
+        while before:  # every stage before it says that there is nothing to do
+            before -= process.stdout.readline().endswith(b"nothing to do\n")
+        time.sleep(rng.uniform(0, duration))
+        process.kill()
+        if process.wait() == -signal.SIGKILL:
+            killed += 1
+        else:  # it was done already: from the start
+            folder = start_of(stage, run, tmp_path / f"run{killed}-{rng.random()}")
+    subprocess.run(stage_command(folder, stage), check=True, capture_output=True, timeout=300)
+    return folder
+
+
+def assert_equal_results(folder, run, stage):
+    """Everything up to the stage is the same to the last bit, and no half-written file is left."""
+    results = sorted(path.relative_to(run) for path in run.rglob("*") if path.is_file() and path.name != "record.json")
+    later = {"autoencoder": ["mdn", "evo", "con"], "mdn_rnn": ["evo", "con"], "rollouts": ["aut", "mdn", "evo", "con"]}
+    for path in results:
+        if not path.name.startswith((".", *later.get(stage, []))):
+            assert (folder / path).read_bytes() == (run / path).read_bytes(), path
+    assert not list(folder.rglob("*.part"))
+
+
+def test_a_killed_training_goes_on_to_the_same_bits(quick_run, tmp_path):
+    assert_equal_results(kill_at_random("autoencoder", quick_run, tmp_path, 1), quick_run, "autoencoder")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_killed_at_twenty_random_moments_ends_with_the_same_bits(stage, quick_run, tmp_path):
+    assert_equal_results(kill_at_random(stage, quick_run, tmp_path, 20), quick_run, stage)
+
+
+def test_half_written_files_of_a_killed_process_are_cleared_away(quick_run, tmp_path, in_this_process):
+    folder = start_of("controller", quick_run, tmp_path / "run")
+    left_over = folder / ".evolution.json.12345.part"
+    left_over.write_bytes(b"{")
+    evolve(VARIANT, SETTINGS, folder, in_this_process)
+    assert not left_over.exists()
+
+
+# Workers
+
+
+def die_once(marker, answer):
+    """A task whose first worker is killed."""
+    if not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return answer
+
+
+def hang_once(marker, answer):
+    """A task whose first worker never ends."""
+    if not marker.exists():
+        marker.touch()
+        time.sleep(10_000)
+    return answer
+
+
+def always_die():
+    """A task that no worker survives."""
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_work_of_a_killed_worker_is_done_again(tmp_path, capfd):
+    with worker_processes(2) as executor:
+        tasks = [(tmp_path / "marker", number) for number in range(6)]
+        assert dict(run_tasks(executor, die_once, tasks)) == {number: number for number in range(6)}
+    assert "a worker process was lost: starting new ones" in capfd.readouterr().err
+
+
+def test_work_of_a_stuck_worker_is_done_again(tmp_path, capfd):
+    with worker_processes(1, time_limit=15) as executor:
+        assert dict(run_tasks(executor, hang_once, [(tmp_path / "marker", 7)])) == {0: 7}
+    assert "they are stuck" in capfd.readouterr().err
+
+
+@pytest.mark.long
+def test_work_that_kills_every_worker_ends_in_an_error():
+    with worker_processes(1) as executor, pytest.raises((TaskError, BrokenProcessPool)):
+        list(run_tasks(executor, always_die, [()]))
+
+
+def test_an_executor_that_never_answers_ends_in_an_error(tmp_path):
+    with ThreadPoolExecutor(1) as executor, pytest.raises(TaskError, match="nothing was heard of the workers for 1 "):
+        list(run_tasks(executor, time.sleep, [(3,)], time_limit=1))
+
+
+def test_a_worker_killed_in_mid_generation_costs_nothing_but_time(quick_run, tmp_path):
+    folder = start_of("controller", quick_run, tmp_path / "run")
+    with worker_processes(2) as executor, ThreadPoolExecutor(1) as killer:
+
+        def kill_one():
+            while not (folder / "evolution.json").exists():
+                time.sleep(0.01)
+            next(iter(executor.pool._processes.values())).kill()
+
+        done = killer.submit(kill_one)
+        evolve(VARIANT, SETTINGS, folder, executor)
+        done.result()
+    assert_equal_results(folder, quick_run, "controller")
+
+
+def test_an_environment_that_raises_stops_the_run_with_its_cause_and_the_run_goes_on_later(
+    quick_run, tmp_path, monkeypatch, in_this_process
+):
+    folder, drive, calls = start_of("controller", quick_run, tmp_path / "run"), evolution.drive, []
+
+    def fragile(*arguments, **named):
+        calls.append(1)
+        if len(calls) == 6:
+            raise RuntimeError("the track has fallen apart")
+        return drive(*arguments, **named)
+
+    monkeypatch.setattr(evolution, "drive", fragile)
+    with pytest.raises(TaskError, match="drive_group failed in a worker: RuntimeError: the track has fallen apart"):
+        evolve(VARIANT, SETTINGS, folder, in_this_process)
+    assert 1 <= len(load_json(folder / "evolution.json")["generations"]) < SETTINGS.generations
+    evolve(VARIANT, SETTINGS, folder, in_this_process)
+    assert_equal_results(folder, quick_run, "controller")
+
+
+# Folders and disks
+
+
+def test_two_processes_do_not_share_a_run_folder(quick_run, tmp_path, capsys):
+    folder = start_of("mdn_rnn", quick_run, tmp_path / "run")
+    holder = "import sys, time; from pathlib import Path; from stad_lab.checkpoints import locked\n"
+    holder += "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(1000)"
+    process = subprocess.Popen([sys.executable, "-c", holder, folder], stdout=subprocess.PIPE)
+    assert process.stdout.readline() == b"held\n"
+    before = snapshot(folder)
+    assert main([*stage_command(folder, "mdn_rnn")[3:]]) == 2
+    assert f"error: {folder} is in use by another process: wait until that has ended" in capsys.readouterr().err
+    assert snapshot(folder) == before
+    process.kill()  # and the lock is free at once
+    process.wait()
+    assert main([*stage_command(folder, "mdn_rnn")[3:]]) == 0
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """small_disk(megabytes) mounts or resizes a disk of that size and returns its folder."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = []
+
+    def mount(megabytes, mode="rw"):
+        options = f"{'remount,' if mounted else ''}size={megabytes}m,{mode}"
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", folder]
+        if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
+            pytest.skip("no right to mount a small disk")
+        mounted.append(folder)
+        return folder
+
+    yield mount
+    if mounted:
+        subprocess.run(["umount", folder], check=True)
+
+
+def test_a_full_disk_stops_the_run_in_one_line_and_more_room_lets_it_go_on(small_disk, quick_run, capsys, command_line):
+    disk = small_disk(8)
+    run = start_of("autoencoder", quick_run, disk / "run")
+    (disk / "ballast").write_bytes(bytes(max(0, shutil.disk_usage(disk).free - 500_000)))
+    assert main(stage_command(run, "autoencoder")[3:]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert re.match(r"error: .*could not be written \(No space left on device\): see to free room", error)
+    assert not (run / "autoencoder.safetensors").exists()
+    small_disk(64)
+    assert command_line(*stage_command(run, "autoencoder")[3:]).returncode == 0
+    assert_equal_results(run, quick_run, "autoencoder")
+
+
+def test_a_read_only_folder_is_refused_before_any_work(small_disk, quick_run, capsys):
+    disk = small_disk(64)
+    run = start_of("mdn_rnn", quick_run, disk / "run")
+    small_disk(64, "ro")
+    assert main(stage_command(run, "mdn_rnn")[3:]) == 2
+    assert f"error: {run} is no folder to write to (Read-only file system): choose" in capsys.readouterr().err
+    begin = time.perf_counter()
+    evaluation = ["evaluate", "--variant", VARIANT, "--path", quick_run, "--json", disk / "evaluation.json"]
+    assert main([str(argument) for argument in evaluation]) == 2
+    assert "evaluation.json could not be written (Read-only file system)" in capsys.readouterr().err
+    assert time.perf_counter() - begin < 10  # not after the drive
+
+
+def test_a_file_too_large_for_the_quota_leaves_the_old_one(tmp_path):
+    script = "import resource, sys; from pathlib import Path; from stad_lab.checkpoints import write_bytes\n"
+    script += "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)); write_bytes(Path(sys.argv[1]), bytes(2000))"
+    write_bytes(tmp_path / "file", b"old")
+    process = subprocess.run([sys.executable, "-c", script, tmp_path / "file"], capture_output=True, text=True)
+    assert "file could not be written (File too large)" in process.stderr
+    assert (tmp_path / "file").read_bytes() == b"old"
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+# Verify
+
+
+def test_verify_drives_recorded_episodes_again(quick_run, command_line):
+    process = command_line("verify", quick_run)
+    assert process.returncode == 0, process.stdout
+    found = dict(line.split(maxsplit=1) for line in process.stdout.replace("log of CMA-ES", "log").splitlines())
+    assert found["rollouts"] == "ok: 8 episodes, 480 frames"
+    assert found["log"] == "ok: 4 generations lead to the same mean"
+    assert re.fullmatch(r"ok: .* points, to the last bit as recorded", found["drives"])
+    assert not any(outcome.startswith("FAILED") for outcome in found.values())
+
+
+def test_verify_finds_a_return_that_no_drive_gives(quick_run, tmp_path, in_this_process, capsys):
+    folder = shutil.copytree(quick_run, tmp_path / "run")
+    log = load_json(folder / "evolution.json")
+    log["generations"][log["best"]["generation"] - 1]["validation"]["returns"][0] += 0.001
+    save_json(folder / "evolution.json", log)
+    assert main(["verify", str(folder)]) == 1
+    assert re.search(r"drives +FAILED: the record says \[.*\], now it was \[", capsys.readouterr().out)
+    record = load_json(folder / "record.json")
+    record["made_with"]["processor"] = "a processor with other last bits"
+    save_json(folder / "record.json", record)
+    drives = verify(folder, in_this_process)["drives"]
+    assert re.match(r"differs: .*; but processor is '.*' and was 'a processor with", drives)
+
+
+# Security
+
+
+def test_a_run_uses_no_network_and_writes_only_into_its_folder(quick_training):
+    folder, process, _ = quick_training  # which the guard of conftest.py has watched
+    assert "guarded" in process.stderr
+    assert "forbidden" not in process.stderr
+    names = {"rollouts", "autoencoder.safetensors", "mdn_rnn.safetensors", "evolution.json", "controller.safetensors"}
+    assert {path.name for path in folder.iterdir()} == names | {"record.json", ".lock"}
