@@ -4,9 +4,10 @@
     renderer    frames a second on one core: Gymnasium, EnvPool if it is installed, and the fast renderer
     loop        frames a second with V + M + C driving, and where the time of a frame goes
     training    V and M trained the plain way and in ours, from the same weights on the same batches
+    cluster     a generation by this machine's own processes and by a Dask cluster, and what many workers would give
 
 A speed says more about a machine than about a program, so every part has a contender that does the same work in the
-usual way. The contenders take turns, in alternating order, and the median of the rounds counts. It takes about eight
+usual way. The contenders take turns, in alternating order, and the median of the rounds counts. It takes about ten
 minutes, and they should be quiet ones: whatever else runs is measured too. Everything runs on the CPU.
 """
 
@@ -15,8 +16,6 @@ import functools
 import importlib.metadata
 import importlib.util
 import multiprocessing
-import platform
-import re
 import shutil
 import tempfile
 import time
@@ -28,15 +27,16 @@ import cv2
 import gymnasium as gym
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
 from tqdm.auto import tqdm
 
-from stad_lab.agent import PRETRAINED, Agent, drive, load_agent
+from stad_lab.agent import PRETRAINED, Agent, drive, load_agent, read_world_model
 from stad_lab.autoencoder import AutoEncoder, autoencoder_losses, save_autoencoder, to_pictures
 from stad_lab.car_racing import BAR_TOP, HULL_COLUMN, HULL_ROW, MAX_FRAMES, make_env, place_car
-from stad_lab.controller import control
-from stad_lab.evolution import drive_group, drive_parallel
+from stad_lab.controller import control, initial_parameters
+from stad_lab.evolution import drive_group, drive_parallel, hand_out, make_strategy
 from stad_lab.frames import OBSERVATION_SHAPE, FrameMemory, to_frame
 from stad_lab.mdn_rnn import MDNRNN, mdn_loss
 from stad_lab.parallel import keep_freed_memory, worker_processes
@@ -55,7 +55,7 @@ def benchmark(parts: list[str], rounds: int = 5) -> dict:
     """Run some parts of the benchmark and print their tables.
 
     Args:
-        parts: of "parity", "renderer", "loop", "training".
+        parts: of "parity", "renderer", "loop", "training", "cluster".
         rounds: how often the contenders take turns; parity has no contenders and is measured once.
 
     Returns:
@@ -70,20 +70,13 @@ def benchmark(parts: list[str], rounds: int = 5) -> dict:
             f"parts={unknown or list(parts)}, rounds={rounds}: choose from {', '.join(PARTS)}, with 1 round or more"
         )
     command = " ".join(["python -m stad_lab benchmark", *(f"--part {part}" for part in parts), f"--rounds {rounds}"])
-    result = {"made_with": provenance(command) | {"trained_on": "cpu", "processor": processor()}, "rounds": rounds}
+    result = {"made_with": provenance(command) | {"trained_on": "cpu"}, "rounds": rounds}
     for part in parts:
         result[part] = PARTS[part](rounds)
         print(f"\n{part}")
         for name, table in result[part].items():
             print(describe(name, table))
     return result
-
-
-def processor() -> str:
-    """The processor's name, as far as the system tells it, and the instructions that PyTorch uses of it."""
-    cpuinfo = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", cpuinfo.read_text()) if cpuinfo.exists() else []
-    return f"{names[0] if names else platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
 
 
 def take_turns(contenders: dict[str, Callable[[int], float]], rounds: int, label: str) -> dict:
@@ -459,9 +452,107 @@ def train_m(plain: bool, seed: int, steps: int = M_STEPS, batch: int | None = No
     return (steps - WARM_UP) * batch * settings.m_sequence / (time.perf_counter() - begin)
 
 
+# Cluster
+
+
+def measure_cluster(rounds: int) -> dict:
+    """A generation of 16 agents on 4 tracks, 250 frames each, by own processes and by Dask workers on this machine.
+
+    A second table holds what the arithmetic of `project` needs, a third what it gives.
+    """
+    from distributed import LocalCluster  # Dask takes a second to import, and few need it
+    from distributed.protocol.pickle import dumps
+
+    from stad_lab.cluster import cluster
+
+    settings, agent = Settings.preset("laptop", max_frames=250, patience=0), load_agent(VARIANT)
+    agents = np.repeat(agent.parameters[None], settings.population * settings.tracks, axis=0)
+    address = {"threads_per_worker": 1, "dashboard_address": None}
+    with (
+        worker_processes(1) as one,
+        worker_processes(2) as two,
+        LocalCluster(1, **address) as small,
+        LocalCluster(2, **address) as large,
+        cluster(small.scheduler_address) as dask_one,
+        cluster(large.scheduler_address) as dask_two,
+    ):
+
+        def generation(executor: Executor, number: int) -> float:
+            tracks = track_seeds("evolve", settings.tracks, 9, number) * settings.population
+            source = hand_out(executor, PRETRAINED / VARIANT, VARIANT)
+            return parallel_speed(executor, source, agents, tracks, settings)
+
+        contenders = {
+            "own processes, 1": lambda number: generation(one, number),
+            "own processes, 2": lambda number: generation(two, number),
+            "Dask, 1 worker": lambda number: generation(dask_one, number),
+            "Dask, 2 workers": lambda number: generation(dask_two, number),
+        }
+        for contender in contenders.values():
+            contender(rounds)
+        tables = {"frames a second, a generation": take_turns(contenders, rounds, "cluster")}
+        costs = {
+            "frames a second, 1 car in a process": np.median(
+                [crowd_speed(one, agent.parameters, 1, settings) for _ in range(rounds)]
+            ),
+            "frames a second, 16 in step": np.median(
+                [crowd_speed(one, agent.parameters, 16, settings) for _ in range(rounds)]
+            ),
+            "milliseconds of Dask for a task": np.median([task_cost(dask_two) for _ in range(rounds)]),
+            "milliseconds of CMA-ES for a generation of 64": np.median([cma_cost() for _ in range(rounds)]),
+            "kilobytes of a task with one car": len(dumps(agent.parameters)) / 1e3,
+            "kilobytes of V and M, once for each worker": len(dumps(read_world_model(PRETRAINED / VARIANT, VARIANT)))
+            / 1e3,
+        }
+    tables["costs"] = {name: float(value) for name, value in costs.items()}
+    tables["projected efficiency, 1,024 episodes of 1,000 frames"] = {
+        f"{workers:,} workers": project(tables["costs"], workers) for workers in (1, 2, 64, 1024)
+    }
+    return tables
+
+
+def task_cost(executor: Executor, count: int = 400) -> float:
+    """Milliseconds that the executor takes for a task that does nothing."""
+    begin = time.perf_counter()
+    for future in [executor.submit(int, number) for number in range(count)]:
+        future.result()
+    return 1e3 * (time.perf_counter() - begin) / count
+
+
+def cma_cost(generations: int = 5) -> float:
+    """Milliseconds that CMA-ES takes to ask for 64 agents of 867 parameters and to be told their fitnesses."""
+    with threadpool_limits(1):
+        strategy = make_strategy(initial_parameters(32, 256), Settings.preset("paper", population=64))
+        begin = time.perf_counter()
+        for _ in range(generations):
+            population = np.array(strategy.ask())
+            strategy.tell(population, (population**2).sum(axis=1))
+        return 1e3 * (time.perf_counter() - begin) / generations
+
+
+def project(costs: dict[str, float], workers: int, episodes: int = 1024, frames: int = 1000) -> float:
+    """Efficiency of so many workers: their speed-up over one, divided by their number.
+
+    Episodes are independent, so they are shared out evenly, at most 16 in step. What one process must do for all comes
+    on top: Dask handles every task by itself, and CMA-ES waits for the last car before it asks again.
+    """
+
+    def seconds(count: int) -> float:
+        cars = min(16, episodes // count)  # that drive in step
+        alone, crowd = (costs[f"frames a second, {name}"] for name in ("1 car in a process", "16 in step"))
+        speed = alone + (crowd - alone) * (cars - 1) / 15  # between the two that were measured
+        serial = costs["milliseconds of Dask for a task"] * episodes / cars
+        return (
+            episodes / count * frames / speed + (serial + costs["milliseconds of CMA-ES for a generation of 64"]) / 1e3
+        )
+
+    return seconds(1) / (workers * seconds(workers))
+
+
 PARTS = {
     "parity": measure_parity,
     "renderer": measure_renderer,
     "loop": measure_loop,
     "training": measure_training,
+    "cluster": measure_cluster,
 }

@@ -151,10 +151,13 @@ def provenance(command: str) -> dict:
 
 
 def processor() -> str:
-    """The processor's name: on another one the last bits of a sum may differ, and with them a whole drive."""
+    """The processor's name, as far as the system tells it, and the instructions that PyTorch uses of it.
+
+    On another one the last bits of a sum may differ, and with them a whole drive.
+    """
     listed = Path("/proc/cpuinfo")
-    names = listed.read_text().partition("model name")[2].partition("\n")[0] if listed.exists() else ""
-    return names.strip("\t :") or platform.processor()
+    name = listed.read_text().partition("model name")[2].partition("\n")[0] if listed.exists() else ""
+    return f"{name.strip(chr(9) + ' :') or platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
 
 
 def git(*arguments: str) -> str | None:

@@ -1,6 +1,9 @@
 """The house: requirements that agree, clean code, documented names, imports that run downward, no hidden code."""
 
 import ast
+import contextlib
+import importlib.metadata
+import re
 import subprocess
 import sys
 import tomllib
@@ -65,6 +68,31 @@ def test_every_requirement_is_bounded_and_box2d_py_is_not_among_them():
 def test_the_installed_versions_are_the_required_ones():
     process = subprocess.run([sys.executable, "-m", "pip", "check"], capture_output=True, text=True, timeout=60)
     assert process.returncode == 0, process.stdout
+
+
+def needed_packages():
+    """Every distribution that environment.txt brings, with what those bring in turn."""
+    waiting, found = ["stad_lab"], {}
+    while waiting:
+        name = waiting.pop()
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):  # for other systems or extras
+            distribution = importlib.metadata.distribution(name)
+            if distribution.name not in found:
+                found[distribution.name] = distribution
+                plain = [line for line in distribution.requires or [] if "extra ==" not in line]
+                waiting += [re.match(r"[\w.-]+", line)[0] for line in plain]
+    return found
+
+
+def test_the_licences_of_all_that_is_installed_go_with_mit():
+    packages = needed_packages()
+    assert {"torch", "distributed", "gymnasium", "jupyterlab"} <= packages.keys()
+    for name, distribution in packages.items():
+        facts = distribution.metadata
+        said = [facts.get("License-Expression") or "", *(facts.get_all("Classifier") or [])]
+        said += [(facts.get("License") or "").partition("\n")[0]]
+        licences = " ".join(line for line in said if "ense" in line or line in said[:1] + said[-1:])
+        assert not re.search(r"(?<!L)GPL|Affero", licences.replace("Lesser General", "")), (name, licences)
 
 
 @pytest.mark.parametrize("command", [["check"], ["format", "--check"]])
