@@ -223,6 +223,15 @@ WRONG = [
         "solved = reaction\ndef reaction(*given): return solved(*given) / 2",
         "compare with -d",
     ),
+    (
+        "02",
+        "reaction-check",
+        "def reaction(vae, film, k):\n"
+        "    frame, difference = to_pictures(film, earlier_frames(film, k))\n"
+        "    mu, turned = vae.encode(frame, difference)[0], vae.encode(frame, -difference)[0]\n"
+        "    return float((mu - turned)[50:].norm() / (mu[50:] - mu[:-50]).norm())",
+        "one norm over all frames",
+    ),
     ("02", "reaction-check", "solved = reaction\ndef reaction(*given): return 1 / solved(*given)", "upside down"),
     (
         "02",
