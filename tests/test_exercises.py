@@ -35,7 +35,7 @@ def run_nbgrader(root, *arguments):
     """Run the real nbgrader in the course at `root`."""
     command = [sys.executable, "-m", "nbgrader", *arguments]
     environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1"}
-    process = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=500, env=environment)
+    process = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900, env=environment)
     assert process.returncode == 0, process.stderr[-3000:]
 
 
