@@ -116,7 +116,10 @@ def test_exercises_are_committed_clean(path):
 @pytest.mark.parametrize("name", NAMES)
 def test_points_in_the_table_are_those_that_nbgrader_gives(name):
     cells = read_cells(SOURCES[name])
-    table = {int(number): int(points) for number, points in re.findall(r"\| (\d) \|.*\| (\d+) \|", cells[0]["source"])}
+    table = {
+        int(number): int(points)
+        for number, points in re.findall(r"\| (\d) \|.*\| (\d+) \| [^|]+ \|\n", cells[0]["source"])
+    }
     points, exercise = dict.fromkeys(table, 0), None
     for cell in cells:
         heading = re.search(r"^## (\d)\. ", cell["source"], re.MULTILINE)
