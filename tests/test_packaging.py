@@ -14,6 +14,7 @@ import pytest
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "stad_lab"
 ROOMS = [
+    "checks",
     "settings",
     "car_racing",
     "frames",

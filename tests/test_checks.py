@@ -1,0 +1,48 @@
+"""The instant checks: right answers pass, wrong ones are told what is wrong, near misses are not let through."""
+
+import numpy as np
+import pytest
+import torch
+
+from stad_lab.checks import check
+
+RIGHT = np.array([0.5, -2.0, 3.0], np.float32)
+
+
+def test_a_right_answer_passes_and_says_so(capsys):
+    check("f(x)", RIGHT.copy(), RIGHT, {"never": RIGHT + 1})
+    check("f(x)", 7, np.int64(7))
+    check("f(x)", torch.ones(2, requires_grad=True), torch.ones(2))
+    assert capsys.readouterr().out == "f(x): right\n" * 3
+
+
+@pytest.mark.parametrize(
+    ("found", "message"),
+    [
+        (None, "f.x. is None: end your function with `return`"),
+        ([0.5, -2.0, 3.0], "is a list: expected an array"),
+        (torch.from_numpy(RIGHT), "is of type Tensor: expected ndarray"),
+        ("0.5", "is of type str"),
+        (RIGHT[:2], r"found shape \(2,\), expected \(3,\)"),
+        (RIGHT[None], r"found shape \(1, 3\), expected \(3,\)"),
+        (np.array([0.5, np.nan, 3.0]), "found 1 numbers that are not finite"),
+        (RIGHT + 0.001 * np.eye(3)[1], r"found -1.999 at index \(1,\), expected -2"),
+        (np.array(["a", "b", "c"]), "found dtype <U1, expected numbers"),
+        (-RIGHT, r"f.x.: the sign .*found -3 at index \(2,\), expected 3|f.x.: the sign .*found 2 at"),
+        (np.full(2, np.nan), "two NaN"),
+    ],
+)
+def test_a_wrong_answer_is_told_what_is_wrong(found, message):
+    with pytest.raises(AssertionError, match=message):
+        check("f(x)", found, RIGHT, {"the sign is turned round": -RIGHT, "two NaN": np.full(2, np.nan)})
+
+
+def test_right_values_of_another_kind_are_refused():
+    with pytest.raises(AssertionError, match="right values, but dtype float64: expected int64"):
+        check("f(x)", np.array([1.0, 2.0]), np.array([1, 2]))
+
+
+def test_the_tolerance_is_a_share_of_the_largest_number():
+    check("f(x)", np.array([0.0, 1000.09]), np.array([0.0, 1000.0]))
+    with pytest.raises(AssertionError, match=r"found 1000\.2"):
+        check("f(x)", np.array([0.0, 1000.2]), np.array([0.0, 1000.0]))

@@ -1,0 +1,376 @@
+"""The exercises: nbgrader itself gives the solutions full marks and the stubs none, and checks name the mistake."""
+
+import importlib.util
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbgrader.api import Gradebook
+
+COURSE = Path(__file__).parent.parent / "notebooks" / "exercises"
+NAMES = sorted(folder.name for folder in (COURSE / "source").iterdir())
+SOURCES = {name: COURSE / "source" / name / f"{name}.ipynb" for name in NAMES}
+NOTEBOOKS = [*SOURCES.values(), *(COURSE / f"{name}.ipynb" for name in NAMES)]
+ENVIRONMENT = os.environ | {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
+
+
+def read_cells(path):
+    """The cells of a notebook, their sources joined."""
+    return [cell | {"source": "".join(cell["source"])} for cell in json.loads(path.read_text())["cells"]]
+
+
+def grading(cell):
+    """nbgrader's metadata of a cell."""
+    return cell["metadata"].get("nbgrader", {"grade": False, "solution": False, "grade_id": None})
+
+
+def run_nbgrader(root, *arguments):
+    """Run the real nbgrader in the course at `root`."""
+    command = [sys.executable, "-m", "nbgrader", *arguments]
+    environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900, env=environment)
+    assert process.returncode == 0, process.stderr[-3000:]
+
+
+def grade(root, name):
+    """Make an assignment, hand in its solution and its empty stub, and have both graded."""
+    shutil.copytree(SOURCES[name].parent, root / "source" / name)
+    shutil.copy(COURSE / "nbgrader_config.py", root)
+    run_nbgrader(root, "generate_assignment", name)
+    for student, work in {"solution": "source", "stub": "release"}.items():
+        shutil.copytree(root / work / name, root / "submitted" / student / name)
+    run_nbgrader(root, "autograde", name, "--create")
+    return root
+
+
+@pytest.fixture(scope="module")
+def courses(tmp_path_factory):
+    """Assignment -> the folder of a course in which it has been made, handed in twice and graded."""
+    roots = [tmp_path_factory.mktemp(name) for name in NAMES]
+    with ThreadPoolExecutor(2) as executor:
+        return dict(zip(NAMES, executor.map(grade, roots, NAMES), strict=True))
+
+
+def scores(root, name, student):
+    """The marks of an assignment: cell -> nbgrader's grade."""
+    with Gradebook(f"sqlite:///{root / 'gradebook.db'}") as gradebook:
+        submission = gradebook.find_submission_notebook(name, name, student)
+        return {grade.name: (grade.auto_score, grade.max_score_gradecell) for grade in submission.grades}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_autograde_gives_the_solution_full_marks_and_the_stub_none(courses, name):
+    root, cells = courses[name], [grading(cell) for cell in read_cells(SOURCES[name])]
+    graded = [cell["grade_id"] for cell in cells if cell["grade"] and not cell["solution"]]
+    full = scores(root, name, "solution")
+    assert {cell: full[cell][0] for cell in graded} == {cell: full[cell][1] for cell in graded}
+    assert sum(full[cell][1] for cell in graded) >= 10
+    assert {score for score, _ in scores(root, name, "stub").values()} == {0}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_cell_of_the_solution_runs(courses, name):
+    notebook = json.loads((courses[name] / "autograded" / "solution" / name / f"{name}.ipynb").read_text())
+    outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
+    assert [output["evalue"] for output in outputs if output["output_type"] == "error"] == []
+    pictures = [output["data"]["text/html"] for output in outputs if "text/html" in output.get("data", {})]
+    assert len(pictures) >= 5
+    assert all(re.search('alt="[^"]{20,}"', "".join(picture)) for picture in pictures)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_student_version_is_what_nbgrader_makes_of_the_source(courses, name):
+    made, committed = courses[name] / "release" / name / f"{name}.ipynb", COURSE / f"{name}.ipynb"
+    assert json.loads(made.read_text()) == json.loads(committed.read_text()), "run notebooks/exercises/generate.py"
+
+
+def test_one_command_makes_all_student_versions(courses, tmp_path):
+    spec = importlib.util.spec_from_file_location("generate", COURSE / "generate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    made = module.generate(tmp_path)
+    assert [path.stem for path in made] == NAMES
+    assert all(path.read_text() == (COURSE / path.name).read_text() for path in made)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_exercises_are_committed_clean(path):
+    text = path.read_text()
+    notebook = json.loads(text)
+    nbformat.validate(nbformat.from_dict(notebook))
+    assert text == json.dumps(notebook, indent=1, ensure_ascii=False) + "\n"
+    ids = [cell["id"] for cell in notebook["cells"]]
+    assert all(re.fullmatch(rf"{path.stem[:2]}-\d\d", name) for name in ids) and len(set(ids)) == len(ids)
+    assert all(cell.get("outputs", []) == [] and cell.get("execution_count") is None for cell in notebook["cells"])
+    if path.parent == COURSE:
+        assert "SOLUTION" not in text and "Model answer" not in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_points_in_the_table_are_those_that_nbgrader_gives(name):
+    cells = read_cells(SOURCES[name])
+    table = {
+        int(number): int(points)
+        for number, points in re.findall(r"\| (\d) \|.*\| (\d+) \| [^|]+ \|\n", cells[0]["source"])
+    }
+    points, exercise = dict.fromkeys(table, 0), None
+    for cell in cells:
+        heading = re.search(r"^## (\d)\. ", cell["source"], re.MULTILINE)
+        exercise = int(heading[1]) if heading else exercise
+        if grading(cell)["grade"]:
+            points[exercise] += grading(cell)["points"]
+    assert points == table and len(table) >= 4
+
+
+@pytest.fixture(scope="module")
+def moments():
+    """Assignment and check -> the names that are defined right before it, if all before is solved."""
+    found = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stad_lab.widgets.show", lambda figure: figure)
+        for name in NAMES:
+            names = {}
+            for cell in read_cells(SOURCES[name]):
+                cell_grading = grading(cell)
+                needed = cell_grading["grade_id"] or re.search(r"^(def|import|from) ", cell["source"], re.MULTILINE)
+                if cell["cell_type"] != "code" or not needed or (cell_grading["grade"] and cell_grading["solution"]):
+                    continue
+                if cell_grading["grade"]:
+                    found[name[:2], cell_grading["grade_id"]] = dict(names), cell["source"]
+                exec(cell["source"], names)
+    return found
+
+
+# Assignment, check, a wrong answer, what the check says to it.
+WRONG = [
+    (
+        "01",
+        "differences-values",
+        "differences = lambda film, k: (film - film[earlier_index(range(9), k)]) / 255",
+        "uint8",
+    ),
+    (
+        "01",
+        "differences-values",
+        "differences = lambda film, k: (film.astype(np.float32) - np.roll(film, k, axis=0)) / 255",
+        "counts from the film's end",
+    ),
+    ("01", "differences-values", "differences = lambda film, k: -episode_differences(film, k)", "sign is turned"),
+    ("01", "differences-start", "differences = lambda film, k: episode_differences(film, k) + 1", "found 1 at index"),
+    (
+        "01",
+        "differences-start",
+        "differences = lambda film, k: np.zeros(film.shape)",
+        "dtype float64: expected float32",
+    ),
+    (
+        "01",
+        "find-motion-made-up",
+        "solved = find_motion\ndef find_motion(*given): return solved(*given)[::-1]",
+        "order is turned round",
+    ),
+    (
+        "01",
+        "find-motion-made-up",
+        "solved = find_motion\ndef find_motion(x, earlier, *grid): return solved(earlier, x, *grid)",
+        "this is the way back",
+    ),
+    ("01", "find-motion-made-up", "find_motion = lambda x, y, turns, forwards: turns[0]", "expected two numbers"),
+    ("01", "find-motion-real", "find_motion = lambda x, y, turns, forwards: (0.0, 3.6)", "yaw rate 0.00 .*, truth 3"),
+    ("01", "find-motion-real", "find_motion = lambda x, y, turns, forwards: (0.31, 0.0)", "speed 0.0, truth 4"),
+    (
+        "01",
+        "interval-check",
+        "solved = correlation_interval\n"
+        "def correlation_interval(x, y, units, rng, resamples): return solved(x, y, np.arange(240), rng, resamples)",
+        "far too narrow: you drew rows",
+    ),
+    (
+        "01",
+        "interval-check",
+        "def correlation_interval(x, y, units, rng, resamples):\n"
+        "    drawn = [np.isin(units, rng.choice(12, 12)) for _ in range(resamples)]\n"
+        "    return np.percentile([np.corrcoef(x[d], y[d])[0, 1] for d in drawn], [2.5, 97.5])",
+        "counts it once",
+    ),
+    ("02", "kl-values", "kl = lambda mu, logvar: (mu**2 + logvar.exp() - 1 - logvar).sum(1)", "1/2 is missing"),
+    (
+        "02",
+        "kl-values",
+        "kl = lambda mu, logvar: 0.5 * (mu**2 + (logvar / 2).exp() - 1 - logvar).sum(1)",
+        "the formula wants its square",
+    ),
+    ("02", "kl-values", "kl = lambda mu, logvar: 0.5 * (mu**2 + logvar.exp() - 1 - logvar)", "each latent by itself"),
+    ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v.exp() * noise", "the variance"),
+    ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v * noise", "is a logarithm"),
+    (
+        "02",
+        "reparameterise-values",
+        "reparameterise = lambda mu, v, noise: (mu + (v / 2).exp() * noise).detach()",
+        "no gradient comes back",
+    ),
+    ("02", "active-check", "active = lambda kl: np.flatnonzero(kl.mean(0) > 0.05)", "order of the numbers"),
+    ("02", "active-check", "active = lambda kl: kl.mean(0) > 0.05", "numbers of those"),
+    ("02", "silence-check", "def silence(z, latents): z[:, latents] = 0; return z", "changed the z"),
+    ("02", "silence-check", "def silence(z, latents): z = z.clone(); z[[1]] = 0; return z", "you silenced pictures"),
+    (
+        "02",
+        "reaction-check",
+        "solved = reaction\ndef reaction(*given): return solved(*given) / 2",
+        "compare with -d",
+    ),
+    (
+        "02",
+        "reaction-check",
+        "def reaction(vae, film, k):\n"
+        "    frame, difference = to_pictures(film, earlier_frames(film, k))\n"
+        "    mu, turned = vae.encode(frame, difference)[0], vae.encode(frame, -difference)[0]\n"
+        "    return float((mu - turned)[50:].norm() / (mu[50:] - mu[:-50]).norm())",
+        "one norm over all frames",
+    ),
+    ("02", "reaction-check", "solved = reaction\ndef reaction(*given): return 1 / solved(*given)", "upside down"),
+    (
+        "02",
+        "mean-interval-check",
+        "mean_interval = lambda values, rng: np.percentile(values, [2.5, 97.5])",
+        "where a drive lies",
+    ),
+    (
+        "02",
+        "mean-interval-check",
+        "mean_interval = lambda values, rng: np.percentile(rng.choice(values, (10000, 12)).mean(1), [5, 95])",
+        "90% interval",
+    ),
+    (
+        "03",
+        "log-density-values",
+        "solved = log_density\nlog_density = lambda logpi, mean, s, target: solved(0 * logpi, mean, s, target)",
+        "weights are missing",
+    ),
+    (
+        "03",
+        "log-density-values",
+        "solved = log_density\nlog_density = lambda *given: -solved(*given)",
+        "sign is turned round",
+    ),
+    (
+        "03",
+        "log-density-far",
+        "log_density = lambda logpi, mean, s, target: "
+        "(logpi + torch.distributions.Normal(mean, s.exp()).log_prob(target[..., None])).exp().sum(-1).log()",
+        "is -inf: expected about .*logsumexp",
+    ),
+    (
+        "03",
+        "log-density-far",
+        "solved = log_density\nlog_density = lambda *given: solved(*given).clamp(min=-1e5)",
+        "no clamp",
+    ),
+    (
+        "03",
+        "moments-check",
+        "moments = lambda p, m, s: ((p.exp() * m).sum(-1), (p.exp() * (2 * s).exp()).sum(-1).sqrt())",
+        "the parts lie apart",
+    ),
+    ("03", "moments-check", "moments = lambda p, m, s: (m.mean(-1), s.mean(-1))", "weigh each mean"),
+    (
+        "03",
+        "horizon-check",
+        "horizon = lambda dream, constant: int((dream.sum(0) > constant.sum(0)).argmax())",
+        "steps count from 1",
+    ),
+    (
+        "03",
+        "horizon-check",
+        "horizon = lambda dream, constant: int((dream.sum(0) > constant.sum(0)).argmax()) + 1",
+        "argmax of no True",
+    ),
+    (
+        "03",
+        "horizon-interval-check",
+        "horizon_interval = lambda dream, constant, rng: "
+        "np.percentile([horizon(dream[[i]], constant[[i]]) for i in range(15)], [2.5, 97.5])",
+        "single drives; draw 15",
+    ),
+    (
+        "03",
+        "horizon-interval-check",
+        "def horizon_interval(dream, constant, rng):\n"
+        "    drawn = [np.take_along_axis(dream, rng.integers(15, size=(15, 60)), 0) for _ in range(2000)]\n"
+        "    return np.percentile([horizon(d, constant) for d in drawn], [2.5, 97.5])",
+        "steps of one drive belong together",
+    ),
+    ("04", "weights-check", "weights = lambda n: np.log(n // 2 + 0.5) - np.log(np.arange(1, n // 2 + 1))", "sum to 1"),
+    (
+        "04",
+        "weights-check",
+        "weights = lambda n: np.log(n // 2 + 0.5) - np.log(np.arange(n // 2))",
+        "ranks count from 1",
+    ),
+    (
+        "04",
+        "new-mean-check",
+        "new_mean = lambda population, cost: weights(10) @ population[np.argsort(cost)[::-1][:5]]",
+        "mean of the worst",
+    ),
+    ("04", "new-mean-check", "new_mean = lambda population, cost: weights(10) @ population[:5]", "was not sorted"),
+    (
+        "04",
+        "ablate-check",
+        "def ablate(c, columns): c[:-3].reshape(3, 288)[:, columns] = 0; return c",
+        "changed the vector",
+    ),
+    (
+        "04",
+        "ablate-check",
+        "def ablate(c, columns): c = c.copy(); c[:-3].reshape(288, 3)[columns] = 0; return c",
+        r"not \(288, 3\)",
+    ),
+    ("04", "expected-best-check", "expected_best = lambda returns, size, rng: returns.max()", "the largest of all"),
+    (
+        "04",
+        "expected-best-check",
+        "expected_best = lambda returns, size, rng: "
+        "np.mean([rng.choice(returns, size, replace=False).max() for _ in range(10000)])",
+        "put the die back",
+    ),
+    (
+        "04",
+        "difference-interval-check",
+        "difference_interval = lambda a, b, rng: "
+        "np.percentile(rng.choice(a, (10000, 30)).mean(1) - rng.choice(b, (10000, 30)).mean(1), [2.5, 97.5])",
+        "tracks of its own",
+    ),
+    (
+        "04",
+        "difference-interval-check",
+        "difference_interval = lambda a, b, rng: np.percentile(a - b, [2.5, 97.5])",
+        "where a track lies",
+    ),
+]
+
+
+@pytest.mark.parametrize(("number", "check", "answer", "message"), WRONG, ids=[f"{w[0]} {w[1]}: {w[3]}" for w in WRONG])
+def test_a_typical_wrong_answer_earns_the_message_that_names_it(moments, number, check, answer, message):
+    names, source = moments[number, check]
+    names = dict(names)
+    exec(answer, names)
+    with pytest.raises(AssertionError, match=message):
+        exec(source, names)
+
+
+def test_every_check_meets_two_wrong_answers():
+    checks = [
+        (name[:2], grading(cell)["grade_id"])
+        for name in NAMES
+        for cell in read_cells(SOURCES[name])
+        if grading(cell)["grade"] and not grading(cell)["solution"]
+    ]
+    assert [check for check in checks if sum(wrong[:2] == check for wrong in WRONG) < 2] == []
