@@ -79,15 +79,21 @@ def record(env: gym.Env, observation: np.ndarray, act: Callable[[np.ndarray], np
     Args:
         act: observation -> action, float32 (3,).
     """
-    observations, actions, rewards, motion, ended = [], [], [], [], False
-    while len(actions) < frames and not ended:
-        observations.append(observation)
-        motion.append(true_motion(env))
-        actions.append(act(observation))
-        observation, reward, terminated, truncated, _ = env.step(actions[-1])
-        rewards.append(reward)
-        ended = terminated or truncated
+    rows, ended = [], False
+    while len(rows) < frames and not ended:
+        motion, action = true_motion(env), act(observation)
+        following, reward, terminated, truncated, _ = env.step(action)
+        rows.append((observation, action, reward, motion))
+        observation, ended = following, terminated or truncated
     env.close()
+    return to_drive(rows)
+
+
+def to_drive(rows: list[tuple]) -> Drive:
+    """Rows (observation, action, reward, motion), one for each frame, as a Drive. ValueError if there are none."""
+    if not rows:
+        raise ValueError("a drive without a frame: drive at least one frame before you look at it")
+    observations, actions, rewards, motion = zip(*rows, strict=True)
     return Drive(np.array(observations), np.array(actions), np.array(rewards, np.float32), np.array(motion))
 
 
