@@ -10,6 +10,7 @@ The paper's figures of the two networks are not public. So the layers are World 
 four transposed ones up), and frame and difference are stacked as six channels instead of three.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -198,14 +199,24 @@ def squared_error(drawn: torch.Tensor, picture: torch.Tensor) -> torch.Tensor:
     return nn.functional.mse_loss(drawn, picture, reduction="sum") / len(picture)
 
 
-def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, folder: Path) -> bool:
+def train_autoencoder(
+    variant: str,
+    settings: Settings,
+    rollouts_folder: Path,
+    folder: Path,
+    watch: Callable[[list[dict]], None] | None = None,
+) -> bool:
     """Train V on the rollouts and write `autoencoder.safetensors` into `folder`; resumes, and returns False if done.
 
     The last twentieth of the episodes is held out; training has a fixed length, and the history shows both losses.
+    `watch` is called with the history whenever it has grown, as `training.fit` does.
     """
     path = Path(folder) / "autoencoder.safetensors"
     if path.exists():
-        check_facts(path, load_autoencoder(path, variant)[1], settings)
+        facts = load_autoencoder(path, variant)[1]
+        check_facts(path, facts, settings)
+        if watch:
+            watch(facts["history"])
         return False
     rollouts = Rollouts(rollouts_folder)
     torch.manual_seed(settings.seed)
@@ -235,9 +246,8 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
 
     checkpoint = path.with_name("autoencoder.training.safetensors")
     label = f"train V ({variant})"
-    history = fit(
-        autoencoder, batch, losses, heldout_losses, settings.v_steps, settings.v_learning_rate, checkpoint, label
-    )
+    rate = settings.v_learning_rate
+    history = fit(autoencoder, batch, losses, heldout_losses, settings.v_steps, rate, checkpoint, label, watch)
     save_autoencoder(path, autoencoder, settings, history)
     checkpoint.unlink()
     return True

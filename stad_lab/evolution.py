@@ -10,6 +10,7 @@ eigendecomposition depend on the number of threads.
 import dataclasses
 import math
 import zlib
+from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -29,12 +30,15 @@ LOG = "evolution.json"
 CONTROLLER = "controller.safetensors"
 
 
-def evolve(variant: str, settings: Settings, folder: Path) -> bool:
+def evolve(variant: str, settings: Settings, folder: Path, watch: Callable[[list[dict]], None] | None = None) -> bool:
     """Evolve C for the V and M in `folder`; writes `evolution.json` after every generation and the best C found.
 
     Every agent of a generation drives the same few tracks; its fitness is its mean return. From time to time the mean
     of the search distribution drives the validation tracks, and the best such mean is kept as `controller.safetensors`:
     choosing the best *agent* instead would choose the luckiest.
+
+    Args:
+        watch: called with the log's generations after each of them is on the disk, and with those of an earlier call.
 
     Returns:
         False if the run was complete already, True if generations were driven.
@@ -45,6 +49,8 @@ def evolve(variant: str, settings: Settings, folder: Path) -> bool:
     """
     folder = Path(folder)
     log = read_log(variant, settings, folder)
+    if watch and log["generations"]:
+        watch(log["generations"])
     if (folder / CONTROLLER).exists():
         load_controller(folder / CONTROLLER, variant)
         if len(log["generations"]) >= settings.generations:
@@ -64,6 +70,8 @@ def evolve(variant: str, settings: Settings, folder: Path) -> bool:
             save_json(folder / LOG, log)
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
+            if watch:
+                watch(log["generations"])
     return True
 
 

@@ -164,7 +164,7 @@ class Session:
             RuntimeError: the episode has ended.
         """
         if self.ended:
-            raise RuntimeError("the episode has ended: begin(track) starts another, enter(world) goes to the other world")
+            raise RuntimeError("the episode has ended: begin(track) another, or enter(world) the other world")
         if self.world == "real":
             self._step_real()
         else:

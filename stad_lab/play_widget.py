@@ -36,7 +36,7 @@ class Loop(threading.Thread):
             while not self.stopped.is_set() and self.seat.advance():
                 now = time.perf_counter()
                 self.seat.pace = 0.9 * self.seat.pace + 0.1 / max(now - before, 1e-3)
-                due, before = max(due + 1 / self.seat.speed.value, now), now
+                due, before = max(due + 1 / self.seat.speed.value, now - 0.1), now  # a short delay is made good
                 self.stopped.wait(max(due - now, 0.002))  # never without a pause: the kernel must hear the keys
         except Exception as error:
             self.seat.error = f"{type(error).__name__}: {error}"

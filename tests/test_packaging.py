@@ -24,6 +24,7 @@ ROOMS = [
     "agent",
     "dream",
     "drives",
+    "play",
     "probe",
     "quality",
     "evolution",
@@ -34,6 +35,7 @@ ROOMS = [
     "plots",
     "film",
     "widgets",
+    "play_widget",
     "__main__",
 ]
 FILES = sorted(PACKAGE.glob("*.py"))
