@@ -20,6 +20,7 @@ from stad_lab.mdn_rnn import MDNRNN, Mixture, encode_frames
 from stad_lab.rollouts import begin_randomly
 from stad_lab.settings import Settings
 
+FRAMES_A_SECOND = 50  # of CarRacing's physics
 MOTION = {  # the columns of `Drive.motion`, with their units
     "forward speed": "world units per second",
     "slip speed": "world units per second, to the right",
@@ -61,6 +62,19 @@ def true_motion(env: gym.Env) -> np.ndarray:
     turned = (hull.angle - direction + np.pi) % (2 * np.pi) - np.pi
     wheel_angle = car_racing.car.wheels[0].joint.angle
     return np.array([along, across, hull.angularVelocity, wheel_angle, offset / TRACK_WIDTH, turned], np.float32)
+
+
+def driven_path(motion: np.ndarray) -> np.ndarray:
+    """Where the car went, by dead reckoning: float32 (T, 6) -> world units (T, 2), from (0, 0), first heading upward.
+
+    The speeds along and across the car are turned by the heading, which is the sum of the yaw rates, and summed: what a
+    car without a map knows of its own way. (Between two frames lie 1/50 seconds.)
+    """
+    forward, slip, yaw_rate = motion[:, :3].astype(float).T / FRAMES_A_SECOND
+    heading = np.cumsum(yaw_rate) - yaw_rate
+    east = slip * np.cos(heading) - forward * np.sin(heading)
+    north = slip * np.sin(heading) + forward * np.cos(heading)
+    return np.stack([np.cumsum(east) - east, np.cumsum(north) - north], axis=1)
 
 
 def road_in_sight(motion: np.ndarray) -> np.ndarray:
