@@ -271,8 +271,8 @@ def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> F
             if shown.any():
                 axis.scatter(*points[shown].T, s=size, color=color, label=driver)
         axis.plot(*points[0], "^", color="black", ms=9, label="start")
-        axis.set(xlabel="world units, to the right of the start", aspect="equal")
-        axis.margins(0.1)
+        axis.set_xlabel("world units, to the right of the start")
+        axis.set_aspect("equal", adjustable="datalim")  # panels of one size, whatever the way was
         axis.set_title(name, fontsize=9)
         axis.legend(frameon=False, fontsize=8)
     axes[0, 0].set_ylabel("world units, ahead of the start")
