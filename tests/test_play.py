@@ -9,9 +9,9 @@ from stad_lab.play import Hand, Session
 
 
 @pytest.fixture
-def session(agent):
-    """A session on track 3."""
-    return Session(agent, track=3)
+def session():
+    """A session with the agent that comes with stad_lab, on track 3."""
+    return Session(load_agent("input"), track=3)
 
 
 def drive(session, *script):
@@ -34,10 +34,10 @@ def test_a_held_key_moves_the_action_smoothly_and_a_released_one_lets_it_fall_ba
     assert hand.act()[0] == 0
 
 
-def test_a_session_that_the_agent_drives_is_the_drive_that_the_agent_drives_alone(session, quick_run):
+def test_a_session_that_the_agent_drives_is_the_drive_that_the_agent_drives_alone(session):
     session.give("agent")
     drive(session, ("", 40))
-    alone = record_drive(load_agent("input_output", quick_run), track=3, frames=40)
+    alone = record_drive(load_agent("input"), track=3, frames=40)
     for name in ("observations", "actions", "rewards", "motion"):
         assert np.array_equal(getattr(session.drive(), name), getattr(alone, name))
     assert not session.by_hand().any() and session.score == pytest.approx(alone.rewards.sum())
