@@ -136,6 +136,7 @@ class Seat:
     def press(self, pedal: str, down: bool) -> None:
         """Hold a pedal, or let it go."""
         (self.session.hand.held.add if down else self.session.hand.held.discard)(pedal)
+        self.told = 0.0  # so that the loop tells at once
 
     def drive(self, on: bool) -> None:
         """Start the loop, or pause it. A loop that another seat may have is stopped."""
@@ -191,7 +192,8 @@ def describe(session: Session, pace: float, error: str = "") -> str:
         where, count = "in the dream", len(session.dream_rows)
         score = "no points in the dream"
     state = "the episode has ended" if session.ended else f"{pace:.0f} pictures a second" if pace else "paused"
-    line = f"<b>{who} {where}</b><br>{score}, frame {count}, {state}"
+    held = ", ".join(sorted(session.hand.held)) or "none"
+    line = f"<b>{who} {where}</b><br>{score}, frame {count}, {state}<br>keys held: {held}"
     return f'<div style="line-height: 1.4">{line}{f"<br><b>{error}</b>" if error else ""}</div>'
 
 

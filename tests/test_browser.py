@@ -26,7 +26,6 @@ playwright = pytest.importorskip(
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 FLAGS = "--no-sandbox --disable-gpu --no-first-run --disable-background-networking --disable-component-update"
-PICTURE = ".jp-OutputArea-output img"
 
 
 @pytest.fixture(scope="module")
@@ -36,15 +35,22 @@ def lab(tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
+    quiet = {"fetchNews": "false", "checkForUpdates": False}
     places = {f"JUPYTER_{kind}_DIR": str(folder / kind) for kind in ("CONFIG", "RUNTIME")}
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", f"--port={port}", "--ip=127.0.0.1"]
     command += ["--IdentityProvider.token=t", f"--ServerApp.root_dir={folder}", "--ServerApp.port_retries=0"]
     command += ["--LabApp.extension_manager=readonly"]
     settings = folder / "CONFIG" / "labconfig" / "default_setting_overrides.json"
     settings.parent.mkdir(parents=True)
-    settings.write_text(json.dumps({"@jupyterlab/apputils-extension:notification": QUIET}))
+    settings.write_text(json.dumps({"@jupyterlab/apputils-extension:notification": quiet}))
     with (folder / "server.log").open("w") as log:
-        server = subprocess.Popen(command, stdout=log, stderr=log, env={**os.environ, **places}, start_new_session=True)
+        server = subprocess.Popen(
+            command,
+            stdout=log,
+            stderr=log,
+            env={**os.environ, **places, "OMP_NUM_THREADS": "1"},
+            start_new_session=True,
+        )
     address = f"http://127.0.0.1:{port}"
     for _ in range(600):
         try:
@@ -56,9 +62,6 @@ def lab(tmp_path_factory):
     yield address, folder
     server.send_signal(signal.SIGTERM)
     server.wait(20)
-
-
-QUIET = {"fetchNews": "false", "checkForUpdates": False}
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +84,7 @@ def run(lab, browser):
 
     def run_notebook(*cells, name="test.ipynb", content=None):
         (folder / name).write_text(json.dumps(content or as_notebook(cells)))
-        page = browser.new_page(viewport={"width": 1300, "height": 1000})
+        page = browser.new_page(viewport={"width": 1300, "height": 1800})
         pages.append(page)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
@@ -93,7 +96,6 @@ def run(lab, browser):
         return page
 
     yield run_notebook
-    print(errors)
     for page in pages:
         page.close()
     assert errors == []
@@ -109,6 +111,56 @@ def as_notebook(cells):
     return {"cells": made, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
 
 
+def wait_for(fact, what, seconds=90):
+    """Wait until fact() holds."""
+    end = time.monotonic() + seconds
+    while not fact():
+        assert time.monotonic() < end, f"{what} did not come about in {seconds} seconds"
+        time.sleep(0.05)
+
+
+def sees_another_picture(picture, act):
+    """Do something, and wait until the picture is another one."""
+    picture.wait_for(timeout=90_000)
+    before = picture.get_attribute("src")
+    act()
+    wait_for(lambda: picture.get_attribute("src") != before, "another picture")
+
+
+SLIDERS = (
+    """
+import numpy as np
+from stad_lab import load_agent
+from stad_lab.drives import look_inside, record_drive
+from stad_lab.plots import plot_curves
+from stad_lab.widgets import explore, explore_latents, slider, view_drive
+def draw(bend):
+    return plot_curves({"line": np.sin(bend * np.arange(20.0))}, f"bend {bend}", "x", "y")
+explore(draw, bend=slider(0.0, 1.0, 0.5, "bend"))
+""",
+    """
+agent = load_agent("input_output")
+explore_latents(agent.autoencoder, np.zeros(32, np.float32))
+""",
+    """
+drive = record_drive(agent, track=4, frames=12)
+view_drive(drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride))
+""",
+)
+
+
+def test_a_moved_slider_draws_another_figure_in_every_widget_that_has_one(run):
+    cells = run(*SLIDERS).locator(".jp-CodeCell")
+    for number, pictures in ((0, 1), (1, 2), (2, 1)):
+        cell = cells.nth(number)
+        handles = cell.locator(".noUi-handle")
+        handles.first.wait_for(timeout=90_000)
+        assert handles.count() == (32 if number == 1 else 1)
+        for place in range(pictures):
+            picture = cell.locator(".jp-OutputArea-output img").nth(place)
+            sees_another_picture(picture, lambda handles=handles: handles.first.press("ArrowRight"))
+
+
 SEAT = """
 from stad_lab import load_agent
 from stad_lab.play import Session
@@ -116,34 +168,104 @@ from stad_lab.play_widget import drive_yourself
 session = Session(load_agent("input"), track=1)
 drive_yourself(session)
 """
+COUNT = """picture => { window.pictures = 0; picture.addEventListener("load", () => { window.pictures += 1 }) }"""
 
 
-def test_seat(run):
+def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(run):
     page = run(SEAT)
-    picture = page.locator(".stad-lab-pixels")
-    try:
-        picture.wait_for(timeout=40_000)
-    finally:
-        page.screenshot(path="/tmp/fail.png")
-    time.sleep(1)
-    page.screenshot(path="/tmp/seat0.png")
-    page.evaluate("""() => { const p = document.querySelector('.stad-lab-pixels'); window.pictures = 0;
-        p.addEventListener('load', () => { window.pictures += 1 }) }""")
+    picture, status = page.locator(".stad-lab-pixels"), page.locator(".widget-html", has_text="frame")
+
+    def tells(text, seconds=90):
+        wait_for(lambda: text in status.first.inner_text(), text, seconds)
+
+    tells("You drive on track 1")
+    picture.evaluate(COUNT)
+    sees_another_picture(picture, lambda: page.get_by_role("button", name="drive").click())
     picture.hover()
-    page.keyboard.down("ArrowUp")
-    page.get_by_role("button", name="drive").click()
-    picture.hover()
+    for key, pedal in (("ArrowUp", "gas"), ("a", "left")):
+        page.keyboard.down(key)
+        tells(f"keys held: {pedal}")
+        page.keyboard.up(key)
+        tells("keys held: none")
     page.keyboard.down("w")
-    time.sleep(2)
-    page.screenshot(path="/tmp/seat1.png")
-    a, t = page.evaluate("window.pictures"), time.time()
-    time.sleep(8)
-    b, u = page.evaluate("window.pictures"), time.time()
-    print("PICTURES", (b - a) / (u - t), os.getloadavg())
+    tells("keys held: gas")
+    before, begin = page.evaluate("window.pictures"), time.monotonic()
+    time.sleep(4)
+    rate = (page.evaluate("window.pictures") - before) / (time.monotonic() - begin)
+    print(f"{rate:.1f} pictures a second arrive in the browser; load {os.getloadavg()[0]:.1f}")
+    assert rate > 5  # a machine that tests in parallel is slow; README says what a free one does
+    page.mouse.move(5, 5)  # the pointer leaves with the key down: the pedal is let go
+    tells("keys held: none")
+    picture.hover()
     page.keyboard.up("w")
+
     page.keyboard.press("t")
-    time.sleep(1)
-    page.screenshot(path="/tmp/seat2.png")
+    tells("The agent drives on track 1")
     page.get_by_role("button", name="the dream").click()
-    time.sleep(2)
-    page.screenshot(path="/tmp/seat3.png")
+    tells("The agent drives in the dream")
+    sees_another_picture(picture, lambda: page.locator(".noUi-handle").first.press("ArrowRight"))
+    picture.hover()
+    page.keyboard.press("t")
+    tells("You drive in the dream")
+    page.get_by_role("button", name="the real track").click()
+    tells("You drive on track 1")
+    if page.get_by_role("button", name="pause").count():
+        picture.hover()
+        page.keyboard.press("p")
+    tells("paused")
+    assert page.locator(".jp-CodeCell").count() == 1  # no key that drives was taken for a command of JupyterLab
+
+
+LIVE = """
+import shutil, tempfile
+from pathlib import Path
+from stad_lab import Settings
+from stad_lab.agent import PRETRAINED
+from stad_lab.evolution import evolve, fitness_curves
+from stad_lab.plots import plot_evolution
+from stad_lab.widgets import watch_training
+if "folder" not in globals():
+    folder = Path(tempfile.mkdtemp())
+    for name in ("autoencoder.safetensors", "mdn_rnn.safetensors"):
+        shutil.copy(PRETRAINED / "input" / name, folder)
+settings = Settings.preset("quick", processes=1, generations=400, max_frames=30, hidden_size=256)
+def draw(log):
+    return plot_evolution(fitness_curves(log), {}, f"generation {len(log)}")
+watch_training(lambda watch: evolve("input", settings, folder, watch), draw)
+"""
+
+
+def test_the_stop_button_ends_a_live_training_in_one_line_and_the_cell_goes_on(run):
+    page = run(LIVE)
+    picture = page.locator(".jp-RenderedHTMLCommon img").first
+    sees_another_picture(picture, lambda: None)
+    page.locator("[data-command='notebook:interrupt-kernel'], [title*='Interrupt']").first.click()
+    page.get_by_text("stopped: nothing that was logged is lost").wait_for(timeout=90_000)
+    drawn = int(re.search(r"generation (\d+)", picture.get_attribute("alt"))[1])
+    page.locator(".jp-CodeCell .cm-content").click()
+    page.keyboard.press("Control+Enter")
+    later = f"a generation after {drawn}"
+    wait_for(lambda: picture.count() and generation(picture) > drawn, later)
+    page.locator("[data-command='notebook:interrupt-kernel'], [title*='Interrupt']").first.click()
+    page.get_by_text("stopped: nothing that was logged is lost").wait_for(timeout=90_000)
+
+
+def generation(picture):
+    """The generation that a figure of the live training shows."""
+    return int(re.search(r"generation (\d+)", picture.get_attribute("alt"))[1])
+
+
+def test_the_first_notebook_runs_to_its_end_in_the_browser(run, lab):
+    name = "00_first_drive.ipynb"
+    page = run(name=name, content=json.loads((NOTEBOOKS / name).read_text()))
+
+    def code_cells():
+        page.keyboard.press("Control+s")
+        time.sleep(0.5)
+        cells = json.loads((lab[1] / name).read_text())["cells"]
+        return [cell for cell in cells if cell["cell_type"] == "code"]
+
+    wait_for(lambda: all(cell["execution_count"] for cell in code_cells()), "the last cell", 180)
+    outputs = [output for cell in code_cells() for output in cell["outputs"]]
+    assert "error" not in [output["output_type"] for output in outputs]
+    assert sum("<img" in str(output.get("data")) for output in outputs) >= 8

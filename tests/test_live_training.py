@@ -1,6 +1,7 @@
 """Training in a real kernel: the stop button ends a cell in one line, and the same cell goes on, bit for bit."""
 
 import json
+import os
 import shutil
 
 import pytest
@@ -40,7 +41,7 @@ print("complete:", watch_training(train, draw))
 @pytest.fixture(scope="module")
 def kernel():
     """A kernel as JupyterLab starts it: (manager, client)."""
-    manager, client = start_new_kernel(kernel_name="python3")
+    manager, client = start_new_kernel(kernel_name="python3", env={**os.environ, "OMP_NUM_THREADS": "1"})
     yield manager, client
     client.stop_channels()
     manager.shutdown_kernel(now=True)
