@@ -141,6 +141,7 @@ class Seat:
     def drive(self, on: bool) -> None:
         """Start the loop, or pause it. A loop that another seat may have is stopped."""
         if on:
+            self.loop = None  # a loop that is still on its way out has no say any more
             stop_loops()
             self.loop, self.pace, self.error = Loop(self), float(self.speed.value), ""
             self.loop.start()

@@ -69,6 +69,11 @@ def test_the_loop_drives_and_pauses_with_keys_held_and_says_who_drives(make_seat
     seat.on_event(key("keyup", "ArrowUp"))
     time.sleep(0.1)
     assert len(seat.session.rows) == driven and seat.session.hand.held == set()
+    for _ in range(9):  # pause and drive on at once, while the old loop is still in a step
+        seat.go.value = not seat.go.value
+    driven = len(seat.session.rows)
+    wait_for(lambda: len(seat.session.rows) > driven + 3)
+    assert seat.go.value and loops() == 1
     seat.on_event(key("keydown", "KeyT"))
     assert seat.session.driver == seat.driver.value == "agent" and "The agent drives" in seat.status.value
 
@@ -105,9 +110,7 @@ def test_the_loop_ends_with_the_episode_and_shows_an_error(make_seat):
     seat = make_seat()
     seat.session.real_ended = True
     seat.go.value = True
-    wait_for(lambda: not seat.go.value)
-    assert "the episode has ended" in seat.status.value
+    wait_for(lambda: not seat.go.value and "the episode has ended" in seat.status.value)
     seat.begin.click()
     seat.session.step = lambda: 1 / 0
-    wait_for(lambda: not seat.go.value)
-    assert "ZeroDivisionError: division by zero" in seat.status.value
+    wait_for(lambda: not seat.go.value and "ZeroDivisionError: division by zero" in seat.status.value)
