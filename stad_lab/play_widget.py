@@ -15,6 +15,7 @@ from stad_lab.widgets import picture_png
 
 PICTURE_SIZE = 448  # pixels on the page
 FRAME_IDLE, FRAME_LISTENING = "4px solid transparent", "4px solid #E69F00"
+LONGEST_WAIT = 0.2  # seconds that the car waits for a browser which has not shown the last pictures yet
 PRESSED, RELEASED = ("mousedown", "touchstart"), ("mouseup", "mouseleave", "touchend", "touchcancel")
 PEDAL_ICONS = {"gas": "arrow-up", "left": "arrow-left", "brake": "arrow-down", "right": "arrow-right"}
 HELP = """<style>.stad-lab-pixels {image-rendering: pixelated}</style><div style="line-height: 1.4">
@@ -38,6 +39,9 @@ class Loop(threading.Thread):
                 self.seat.pace = 0.9 * self.seat.pace + 0.1 / max(now - before, 1e-3)
                 due, before = max(due + 1 / self.seat.speed.value, now - 0.1), now  # a short delay is made good
                 self.stopped.wait(max(due - now, 0.002))  # never without a pause: the kernel must hear the keys
+                patience = time.perf_counter() + LONGEST_WAIT
+                while self.seat.browser_is_behind() and time.perf_counter() < patience:
+                    self.stopped.wait(0.005)
         except Exception as error:
             self.seat.error = f"{type(error).__name__}: {error}"
         finally:
@@ -83,6 +87,9 @@ class Seat:
         self.speed = ipywidgets.IntSlider(30, min=10, max=50)
         self.track = ipywidgets.BoundedIntText(session.track, min=0, max=999_999, layout={"width": "110px"})
         self.begin = ipywidgets.Button(description="begin", icon="flag", layout={"width": "124px"})
+        # The browser copies the number of the last picture back: without an answer, pictures would pile up in a slow one.
+        self.sent, self.seen = ipywidgets.IntText(), ipywidgets.IntText()
+        self.answer = ipywidgets.jsdlink((self.sent, "value"), (self.seen, "value"))
         self._connect()
         self.show()
         self.view = ipywidgets.Box([self.picture, self._controls()], layout={"flex_flow": "row wrap"})
@@ -173,9 +180,14 @@ class Seat:
         with self.lock:
             picture = self.session.picture()
         self.picture.value = picture_png(picture, len(picture))
+        self.sent.value += 1
         if time.perf_counter() - self.told > every:
             self.told = time.perf_counter()
             self.status.value = describe(self.session, self.pace if self.go.value else 0.0, self.error)
+
+    def browser_is_behind(self) -> bool:
+        """Whether a browser is there and has more than two pictures still to show."""
+        return 0 < self.seen.value < self.sent.value - 2
 
     def _command(self, do, value) -> None:
         with self.lock:

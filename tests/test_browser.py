@@ -86,7 +86,7 @@ def run(lab, browser):
 
     def run_notebook(*cells, name="test.ipynb", content=None):
         (folder / name).write_text(json.dumps(content or as_notebook(cells)))
-        page = browser.new_page(viewport={"width": 1300, "height": 1800})
+        page = browser.new_page(viewport={"width": 1300, "height": 1400})
         pages.append(page)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)

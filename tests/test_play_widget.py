@@ -114,3 +114,15 @@ def test_the_loop_ends_with_the_episode_and_shows_an_error(make_seat):
     seat.begin.click()
     seat.session.step = lambda: 1 / 0
     wait_for(lambda: not seat.go.value and "ZeroDivisionError: division by zero" in seat.status.value)
+
+
+def test_the_car_waits_for_a_slow_browser_and_for_none_that_is_not_there(make_seat):
+    seat = make_seat()
+    assert not seat.browser_is_behind()
+    seat.seen.value = seat.sent.value  # a browser has answered
+    for _ in range(3):
+        assert not seat.browser_is_behind()
+        seat.show()
+    assert seat.browser_is_behind()
+    seat.seen.value = seat.sent.value - 1
+    assert not seat.browser_is_behind()
