@@ -119,10 +119,10 @@ def test_the_loop_ends_with_the_episode_and_shows_an_error(make_seat):
 def test_the_car_waits_for_a_slow_browser_and_for_none_that_is_not_there(make_seat):
     seat = make_seat()
     assert not seat.browser_is_behind()
-    seat.seen.value = seat.sent.value  # a browser has answered
-    for _ in range(3):
-        assert not seat.browser_is_behind()
+    for _ in range(40):
         seat.show()
+    assert seat.sent.value == 40 and not seat.browser_is_behind()  # nobody has ever answered
+    seat.seen.value = 20
     assert seat.browser_is_behind()
-    seat.seen.value = seat.sent.value - 1
+    seat.seen.value = 30
     assert not seat.browser_is_behind()
