@@ -172,7 +172,8 @@ from stad_lab.play_widget import drive_yourself
 session = Session(load_agent("input"), track=1)
 drive_yourself(session)
 """
-COUNT = """picture => { window.pictures = 0; picture.addEventListener("load", () => { window.pictures += 1 }) }"""
+COUNT = """picture => { window.pictures = 0; new MutationObserver(() => { window.pictures += 1 }).observe(
+    picture, { attributes: true, attributeFilter: ["src"] }) }"""
 
 
 def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(run):
