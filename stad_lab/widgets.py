@@ -10,7 +10,7 @@ from collections.abc import Callable
 import ipywidgets
 import numpy as np
 import torch
-from IPython.display import HTML, display
+from IPython.display import HTML, DisplayHandle
 from matplotlib.figure import Figure
 from PIL import Image
 from pygments import highlight
@@ -85,7 +85,8 @@ def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]]
     Returns:
         False if it was interrupted, True if the training is complete.
     """
-    place = display(HTML(""), display_id=True)
+    place = DisplayHandle()
+    place.display(HTML(""))
     try:
         train(lambda entries: place.update(show(draw(entries))))
     except KeyboardInterrupt:
