@@ -10,6 +10,7 @@ The paper's figures of the two networks are not public. So the layers are World 
 four transposed ones up), and frame and difference are stacked as six channels instead of three.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -198,10 +199,17 @@ def squared_error(drawn: torch.Tensor, picture: torch.Tensor) -> torch.Tensor:
     return nn.functional.mse_loss(drawn, picture, reduction="sum") / len(picture)
 
 
-def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, folder: Path) -> bool:
+def train_autoencoder(
+    variant: str,
+    settings: Settings,
+    rollouts_folder: Path,
+    folder: Path,
+    watch: Callable[[list[dict]], None] | None = None,
+) -> bool:
     """Train V on the rollouts and write `autoencoder.safetensors` into `folder`; resumes, and returns False if done.
 
     The last twentieth of the episodes is held out; training has a fixed length, and the history shows both losses.
+    `watch` is called with the history whenever it has grown, as `training.fit` does.
 
     Raises:
         ValueError: the weights, checkpoint or rollouts in the folders are damaged or of another run.
@@ -210,7 +218,10 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
     """
     path = Path(folder) / "autoencoder.safetensors"
     if path.exists():
-        check_facts(path, load_autoencoder(path, variant)[1], settings)
+        facts = load_autoencoder(path, variant)[1]
+        check_facts(path, facts, settings)
+        if watch:
+            watch(facts["history"])
         return False
     rollouts = Rollouts(rollouts_folder)
     torch.manual_seed(settings.seed)
@@ -243,7 +254,7 @@ def train_autoencoder(variant: str, settings: Settings, rollouts_folder: Path, f
     identity = {"part": "autoencoder", "variant": variant, "rollouts": rollouts.identity, **settings.as_dict()}
     steps, rate = settings.v_steps, settings.v_learning_rate
     with locked(path.parent):
-        history = fit(autoencoder, batch, losses, heldout_losses, steps, rate, checkpoint, label, identity)
+        history = fit(autoencoder, batch, losses, heldout_losses, steps, rate, checkpoint, label, identity, watch)
         save_autoencoder(path, autoencoder, settings, history, rollouts.identity)
         checkpoint.unlink()
     return True

@@ -20,6 +20,7 @@ from stad_lab.mdn_rnn import MDNRNN, Mixture, encode_frames
 from stad_lab.rollouts import begin_randomly
 from stad_lab.settings import Settings
 
+FRAMES_A_SECOND = 50  # of CarRacing's physics
 MOTION = {  # the columns of `Drive.motion`, with their units
     "forward speed": "world units per second",
     "slip speed": "world units per second, to the right",
@@ -63,6 +64,19 @@ def true_motion(env: gym.Env) -> np.ndarray:
     return np.array([along, across, hull.angularVelocity, wheel_angle, offset / TRACK_WIDTH, turned], np.float32)
 
 
+def driven_path(motion: np.ndarray) -> np.ndarray:
+    """Where the car went, by dead reckoning: float32 (T, 6) -> world units (T, 2), from (0, 0), first heading upward.
+
+    The speeds along and across the car are turned by the heading, which is the sum of the yaw rates, and summed: what a
+    car without a map knows of its own way. (Between two frames lie 1/50 seconds.)
+    """
+    forward, slip, yaw_rate = motion[:, :3].astype(float).T / FRAMES_A_SECOND
+    heading = np.cumsum(yaw_rate) - yaw_rate
+    east = slip * np.cos(heading) - forward * np.sin(heading)
+    north = slip * np.sin(heading) + forward * np.cos(heading)
+    return np.stack([np.cumsum(east) - east, np.cumsum(north) - north], axis=1)
+
+
 def road_in_sight(motion: np.ndarray) -> np.ndarray:
     """Whether the car is within 3 half road widths of the centre line and heads along the road: bool (T,).
 
@@ -79,15 +93,21 @@ def record(env: gym.Env, observation: np.ndarray, act: Callable[[np.ndarray], np
     Args:
         act: observation -> action, float32 (3,).
     """
-    observations, actions, rewards, motion, ended = [], [], [], [], False
-    while len(actions) < frames and not ended:
-        observations.append(observation)
-        motion.append(true_motion(env))
-        actions.append(act(observation))
-        observation, reward, terminated, truncated, _ = env.step(actions[-1])
-        rewards.append(reward)
-        ended = terminated or truncated
+    rows, ended = [], False
+    while len(rows) < frames and not ended:
+        motion, action = true_motion(env), act(observation)
+        following, reward, terminated, truncated, _ = env.step(action)
+        rows.append((observation, action, reward, motion))
+        observation, ended = following, terminated or truncated
     env.close()
+    return to_drive(rows)
+
+
+def to_drive(rows: list[tuple]) -> Drive:
+    """Rows (observation, action, reward, motion), one for each frame, as a Drive. ValueError if there are none."""
+    if not rows:
+        raise ValueError("a drive without a frame: drive at least one frame before you look at it")
+    observations, actions, rewards, motion = zip(*rows, strict=True)
     return Drive(np.array(observations), np.array(actions), np.array(rewards, np.float32), np.array(motion))
 
 

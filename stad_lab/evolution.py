@@ -10,6 +10,7 @@ eigendecomposition depend on the number of threads.
 import dataclasses
 import math
 import zlib
+from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,13 @@ LOG = "evolution.json"
 CONTROLLER = "controller.safetensors"
 
 
-def evolve(variant: str, settings: Settings, folder: Path, executor: Executor | None = None) -> bool:
+def evolve(
+    variant: str,
+    settings: Settings,
+    folder: Path,
+    executor: Executor | None = None,
+    watch: Callable[[list[dict]], None] | None = None,
+) -> bool:
     """Evolve C for the V and M in `folder`; writes `evolution.json` after every generation and the best C found.
 
     Every agent of a generation drives the same few tracks; its fitness is its mean return. From time to time the mean
@@ -48,6 +55,7 @@ def evolve(variant: str, settings: Settings, folder: Path, executor: Executor | 
 
     Args:
         executor: who drives; None for `settings.processes` processes of this machine.
+        watch: called with the log's generations after each of them is on the disk, and with those of an earlier call.
 
     Returns:
         False if the run was complete already, True if there was something to do.
@@ -62,6 +70,8 @@ def evolve(variant: str, settings: Settings, folder: Path, executor: Executor | 
     world_model = read_world_model(folder, variant)
     log = read_log(variant, settings, folder, world_model)
     kept = kept_generation(variant, folder, log)
+    if watch and log["generations"]:
+        watch(log["generations"])
     if log["best"] and kept == log["best"]["generation"] and len(log["generations"]) >= settings.generations:
         return False
     with locked(folder), threadpool_limits(1), worker_processes(settings.processes, executor) as executor:
@@ -83,6 +93,8 @@ def evolve(variant: str, settings: Settings, folder: Path, executor: Executor | 
                 keep_controller(variant, folder, log, strategy.mean, world_model)
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
+            if watch:
+                watch(log["generations"])
     return True
 
 

@@ -263,6 +263,25 @@ def plot_fit(x: np.ndarray, y: np.ndarray, samples: dict[str, tuple[np.ndarray, 
     return figure
 
 
+def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
+    """Driven paths seen from above, a panel for each: name -> (points (T, 2), whether the hand drove, bool (T,))."""
+    figure, axes = new_figure(max(3.4 * len(paths), 5.0), 3.9, 1, len(paths))
+    for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
+        for driver, shown, color, size in (("agent", ~by_hand, BLUE, 4), ("hand", by_hand, ORANGE, 12)):
+            if shown.any():
+                axis.scatter(*points[shown].T, s=size, color=color, label=driver)
+        axis.plot(*points[0], "^", color="black", ms=9, label="start")
+        axis.set_xlabel("world units, to the right of the start")
+        axis.set_aspect("equal", adjustable="datalim")  # panels of one size, whatever the way was
+        axis.set_title(name, fontsize=9)
+        axis.legend(frameon=False, fontsize=8)
+    axes[0, 0].set_ylabel("world units, ahead of the start")
+    figure.suptitle(title, fontsize=11)
+    ends = ", ".join(f"{name}: {len(hand)} frames, {hand.sum()} by hand" for name, (_, hand) in paths.items())
+    figure.set_label(f"{title}. The way of the car from above. {ends}.")
+    return figure
+
+
 def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
     """Everything about one moment of a drive: pictures, latents, forecast, action, and the return so far.
 

@@ -38,6 +38,7 @@ def fit(
     checkpoint: Path,
     label: str,
     identity: dict,
+    watch: Callable[[list[dict]], None] | None = None,
 ) -> list[dict]:
     """Train `model` in place for `steps` steps, or for those left after the checkpoint.
 
@@ -49,6 +50,7 @@ def fit(
         checkpoint: file of the training state, read if it exists, written with every entry of the history.
         label: what the progress bar says.
         identity: settings and checksums of all that the training depends on; a checkpoint of another one is refused.
+        watch: called with the history so far, after the checkpoint of every entry and when a run is resumed.
 
     Returns:
         The history: entries {"step", "train": means since the last entry, "heldout"}, a twentieth of the run apart.
@@ -65,6 +67,8 @@ def fit(
     every = max(1, steps // RECORDS)
     step = start
     try:
+        if watch and history:
+            watch(history)
         progress = tqdm(read_ahead(batch, range(start, steps)), label, steps, initial=start, unit="step")
         for step, present in progress:
             for group in optimizer.param_groups:
@@ -89,6 +93,8 @@ def fit(
                 sums = {}
                 progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
                 save_state(checkpoint, model, optimizer, history, identity)
+                if watch:
+                    watch(history)
     except KeyboardInterrupt:
         # The interrupt may have come in mid-update; the checkpoint of the last record is whole, so it stays.
         print(f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint")

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import ipywidgets
 import numpy as np
 import torch
-from IPython.display import HTML
+from IPython.display import HTML, DisplayHandle
 from matplotlib.figure import Figure
 from PIL import Image
 from pygments import highlight
@@ -21,6 +21,8 @@ from stad_lab.autoencoder import AutoEncoder, to_array
 from stad_lab.dream import to_uint8
 from stad_lab.drives import Drive, Inside
 from stad_lab.plots import difference_colors, plot_moment, to_png
+
+Watch = Callable[[list[dict]], None]  # what a training calls with its entries so far
 
 
 def show(figure: Figure) -> HTML:
@@ -67,6 +69,30 @@ def explore(draw: Callable[..., Figure], **controls: ipywidgets.Widget) -> ipywi
         control.observe(redraw, "value")
     redraw()
     return ipywidgets.VBox([*controls.values(), picture])
+
+
+def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]], Figure]) -> bool:
+    """Train in a notebook cell under a figure that is drawn anew with every entry of the log.
+
+    The stop button ends the cell in one line instead of an error: what was logged lies on the disk, and the same cell
+    run again goes on from there. The figure is an ordinary output, which stays in the page when the kernel is gone.
+
+    Args:
+        train: is given the function to call with the entries so far, as `watch` of `evolution.evolve` and of
+            `autoencoder.train_autoencoder`.
+        draw: entries -> Figure.
+
+    Returns:
+        False if it was interrupted, True if the training is complete.
+    """
+    place = DisplayHandle()
+    place.display(HTML(""))
+    try:
+        train(lambda entries: place.update(show(draw(entries))))
+    except KeyboardInterrupt:
+        print("stopped: nothing that was logged is lost, run this cell again to go on")
+        return False
+    return True
 
 
 def slider(low: float, high: float, value: float, label: str) -> ipywidgets.Widget:

@@ -28,6 +28,7 @@ ROOMS = [
     "agent",
     "dream",
     "drives",
+    "play",
     "probe",
     "quality",
     "evolution",
@@ -40,6 +41,7 @@ ROOMS = [
     "plots",
     "film",
     "widgets",
+    "play_widget",
     "__main__",
 ]
 FILES = sorted(PACKAGE.glob("*.py"))
