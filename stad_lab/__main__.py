@@ -1,4 +1,4 @@
-"""The command line: python -m stad_lab train | evaluate | study | benchmark | film | ship."""
+"""The command line: python -m stad_lab check | train | evaluate | study | benchmark | film | ship."""
 
 import argparse
 import dataclasses
@@ -6,6 +6,12 @@ import json
 import sys
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+
+from stad_lab.environment import check_environment
+
+if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports that a broken installation would fail
+    print(report := check_environment())
+    sys.exit(0 if report.ok else 1)
 
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import VARIANTS
@@ -33,6 +39,8 @@ def build_parser() -> argparse.ArgumentParser:
         help=f"which pictures V sees and redraws: {', '.join(VARIANTS)} (frame is World Models; input adds the"
         " difference image to what V sees, output to what it redraws)",
     )
+
+    commands.add_parser("check", help="is everything installed, and what to do about what is not")
 
     command = commands.add_parser(
         "train",
@@ -139,7 +147,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
     options = build_parser().parse_args(arguments)
     try:
-        if options.command == "train":
+        if options.command == "check":
+            print(report := check_environment())
+            return 0 if report.ok else 1
+        elif options.command == "train":
             settings = changed_settings(options.settings, options.set)
             if not train(options.variant, settings, options.out, options.rollouts, options.until):
                 print(f"everything up to {options.until} is there in {options.out}: nothing to do")

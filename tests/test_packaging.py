@@ -34,6 +34,7 @@ ROOMS = [
     "plots",
     "film",
     "widgets",
+    "environment",
     "__main__",
 ]
 FILES = sorted(PACKAGE.glob("*.py"))
