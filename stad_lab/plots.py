@@ -64,7 +64,7 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
 
     Args:
         speed: of the car in every ride, world units per second.
-        change: stride -> mean |d| at the end of every ride.
+        change: stride -> mean `|d|` at the end of every ride.
     """
     figure, ((axis,),) = new_figure(6.5, 3.6)
     for (stride, values), color in zip(change.items(), COLORS, strict=False):
