@@ -6,6 +6,7 @@ Nothing needs a network, neither the build nor the finished pages.
 """
 
 import hashlib
+import os
 import sys
 from pathlib import Path
 
@@ -43,6 +44,7 @@ templates_path = [str(HERE / "_templates")]
 suppress_warnings = ["myst.header"]  # a notebook's markdown cell may begin a step at the second level
 
 # Notebooks
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # on busy cores, threads that wait for each other slow PyTorch manyfold
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(HERE / "_cache" / f"{Settings.preset().name}-{digest(PACKAGE)}")
 nb_execution_timeout = 600

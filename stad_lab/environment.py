@@ -86,8 +86,8 @@ class Report:
 def check_environment(folder: str | Path = ".") -> Report:
     """Look at the versions, Box2D and the pictures, the weights, the machine, the folder and the widgets.
 
-    Nothing that is missing or broken stops it: what a check raises becomes its red line. It takes a second or two,
-    most of it for importing PyTorch.
+    Nothing that is missing or broken stops it: what a check raises becomes its red line. Most of its time goes into
+    importing what the notebooks will import anyway.
 
     Args:
         folder: where you work: looked at for space and for the right to write.
@@ -205,14 +205,16 @@ def check_drive() -> Iterator[Line]:
 
 
 def check_processors() -> Iterator[Line]:
-    """Processor cores that this process may use."""
+    """Processor cores that this process may use, and whether others keep them busy."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if cores > 1:
-        yield Line(GREEN, "cores", f"{cores}")
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    remedy = "close other programs; on a shared machine, set OMP_NUM_THREADS=1 before you start JupyterLab"
+    if load > 2 * cores and os.environ.get("OMP_NUM_THREADS") != "1":  # PyTorch's threads then wait for each other
+        yield Line(AMBER, "cores", f"{cores}, and on average {load:.0f} processes want them", remedy)
+    elif cores == 1:
+        yield Line(AMBER, "cores", "1", "all works, at half the stated speed or less: add --set processes=1 to train")
     else:
-        yield Line(
-            AMBER, "cores", "1", "everything works, at half the stated speed or less: add --set processes=1 to train"
-        )
+        yield Line(GREEN, "cores", f"{cores}")
 
 
 def check_memory() -> Iterator[Line]:
