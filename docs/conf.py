@@ -58,6 +58,7 @@ default_role = "code"
 autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
 autodoc_default_options = {"members": True}
 napoleon_numpy_docstring = False
 
