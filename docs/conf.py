@@ -34,7 +34,6 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
-    "sphinx.ext.viewcode",
     "sphinx-mathjax-offline",  # formulas without a network: it serves MathJax from the site itself
 ]
 root_doc = "docs/index"
@@ -65,7 +64,7 @@ napoleon_numpy_docstring = False
 # Looks
 html_theme = "furo"
 html_title = "stad_lab"
-html_static_path = ["_static"]
+html_static_path = [str(HERE / "_static")]
 html_css_files = ["site.css"]
 html_show_copyright = False
 html_show_sphinx = False

