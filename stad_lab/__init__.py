@@ -4,8 +4,25 @@ An independent, teachable replication of STAD (Kotyan, Vargas, Venkanna, 2019): 
 difference images in the auto encoder. Start with the notebooks; `python -m stad_lab --help` is the command line.
 """
 
-from stad_lab.agent import Agent, load_agent
-from stad_lab.car_racing import make_env
-from stad_lab.settings import Settings
+import importlib
 
-__all__ = ["Agent", "Settings", "load_agent", "make_env"]
+HOMES = {
+    "Agent": "agent",
+    "Settings": "settings",
+    "check_environment": "environment",
+    "load_agent": "agent",
+    "make_env": "car_racing",
+}
+__all__ = ["Agent", "Settings", "check_environment", "load_agent", "make_env"]
+
+
+def __getattr__(name: str):
+    """Import a public name when it is first asked for, so that `check_environment` runs where PyTorch does not."""
+    if name not in HOMES:
+        raise AttributeError(f"module 'stad_lab' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"stad_lab.{HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    """The public names."""
+    return __all__

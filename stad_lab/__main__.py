@@ -1,4 +1,4 @@
-"""The command line: python -m stad_lab train | evaluate | verify | study | benchmark | film | ship."""
+"""The command line: python -m stad_lab check | train | evaluate | verify | study | benchmark | film | ship."""
 
 import argparse
 import contextlib
@@ -9,6 +9,12 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
+
+from stad_lab.environment import check_environment
+
+if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports that a broken installation would fail
+    print(report := check_environment())
+    sys.exit(0 if report.ok else 1)
 
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import VARIANTS
@@ -39,6 +45,7 @@ def build_parser() -> argparse.ArgumentParser:
         " difference image to what V sees, output to what it redraws)",
     )
 
+    commands.add_parser("check", help="is everything installed, and what to do about what is not")
     scheduler = argparse.ArgumentParser(add_help=False)
     scheduler.add_argument(
         "--scheduler",
@@ -171,7 +178,10 @@ def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
     options = build_parser().parse_args(arguments)
     try:
-        if options.command == "train":
+        if options.command == "check":
+            print(report := check_environment())
+            return 0 if report.ok else 1
+        elif options.command == "train":
             settings = changed_settings(options.settings, options.set)
             with drivers(options.scheduler) as executor:
                 worked = train(options.variant, settings, options.out, options.rollouts, options.until, executor)

@@ -1,12 +1,14 @@
 """From an empty folder to a trained agent: the four stages in order, each resumable, and the record of the run.
 
-rollouts/                     the random driver's episodes
-autoencoder.safetensors       V
-mdn_rnn.safetensors           M
-evolution.json                every generation of CMA-ES
-controller.safetensors        C: the CMA mean that drove the validation tracks best
-record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
-                              stage, and the most memory that a process has held by its end (in MB, for each start)
+The folder of a run::
+
+    rollouts/                     the random driver's episodes
+    autoencoder.safetensors       V
+    mdn_rnn.safetensors           M
+    evolution.json                every generation of CMA-ES
+    controller.safetensors        C: the CMA mean that drove the validation tracks best
+    record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
+                                  stage, and the most memory that a process has held by its end (in MB, for each start)
 """
 
 import importlib.metadata

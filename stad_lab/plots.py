@@ -17,6 +17,7 @@ from stad_lab.drives import Drive, Inside
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
+MARKERS = "os^DvP"  # beside the colours: to colour-blind eyes GREEN and PURPLE are two greys
 DIFFERENCE_MAP = "PuOr_r"
 
 
@@ -64,7 +65,7 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
 
     Args:
         speed: of the car in every ride, world units per second.
-        change: stride -> mean |d| at the end of every ride.
+        change: stride -> mean `|d|` at the end of every ride.
     """
     figure, ((axis,),) = new_figure(6.5, 3.6)
     for (stride, values), color in zip(change.items(), COLORS, strict=False):
@@ -148,14 +149,15 @@ def plot_curves(
 
     Args:
         x: of all lines; None to count 1, 2, 3, ...
-        marker: matplotlib's name of a mark at each point.
+        marker: matplotlib's name of a mark at each point; with more than four lines each has a shape of its own.
         **axis_settings: of matplotlib's axis, for example `xscale="log"`.
     """
     many = len(curves) > 4  # then the names stand beside the lines
     figure, ((axis,),) = new_figure(7.5 if many else 6.5, 3.2)
-    for (name, values), color in zip(curves.items(), COLORS, strict=False):
+    shapes = MARKERS if many and marker else [marker] * len(curves)
+    for (name, values), color, shape in zip(curves.items(), COLORS, shapes, strict=False):
         places = np.arange(1, len(values) + 1) if x is None else x
-        axis.plot(places, values, color=color, label=name, marker=marker)
+        axis.plot(places, values, color=color, label=name, marker=shape)
     axis.set(xlabel=xlabel, ylabel=ylabel, **axis_settings)
     beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5)} if many else {}
     axis.legend(frameon=False, fontsize=9, **beside)

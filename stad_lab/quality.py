@@ -1,8 +1,8 @@
 """How good V and M are on drives that they have not seen, each against the simplest thing that could do its job.
 
-V: the squared error, split into road, grass and car; the nats that each latent tells.
-M: the negative log-likelihood beside that of simple forecasts; whether its probabilities mean what they say (PIT);
-   how the error of a dream grows with the number of steps since it last saw the road.
+- V: the squared error, split into road, grass and car; the nats that each latent tells.
+- M: the negative log-likelihood beside that of simple forecasts; whether its probabilities mean what they say (PIT);
+  how the error of a dream grows with the number of steps since it last saw the road.
 """
 
 import math

@@ -23,7 +23,7 @@ class Settings:
     name: str = "laptop"
     """Name of the preset these settings began as."""
     seed: int = 0
-    """Seed of the whole run: data, weights, mutations and all tracks but those for validation follow from it."""
+    """Seed of the whole run. Data, weights, mutations and all tracks but those for validation follow from it."""
     processes: int = 2
     """Worker processes that drive cars. The results do not depend on it."""
 
@@ -83,7 +83,7 @@ class Settings:
     sigma: float = 0.1
     """CMA-ES's first step size."""
     initial_gas: float = -0.5
-    """Gas output of the first controller before squashing: (tanh(-0.5) + 1) / 2 is 27% gas."""
+    """Gas output of the first controller before squashing; (tanh(-0.5) + 1) / 2 is 27% gas."""
     patience: int = 100
     """In training, an episode that reaches no new tile for this many frames is ended; 0 for never."""
     max_frames: int = 1000

@@ -1,4 +1,4 @@
-"""The study: what the latents know, measured on drives that nothing was trained on. Its record is what we report.
+"""The study: what the latents know, measured on drives that nothing was trained on. Its record is what we report::
 
     probe        how well six numbers of the car's true motion can be read off z, and off z and h, in every variant, in
                  a V without training, and for other strides

@@ -36,7 +36,13 @@ def show_film(gif: bytes, alt: str) -> HTML:
 
 
 def show_picture(content: bytes, kind: str, alt: str) -> HTML:
-    """A picture as HTML: the notebook formats for bare pictures lose the alternative text on the way to a page."""
+    """A picture as HTML: the notebook formats for bare pictures lose the alternative text on the way to a page.
+
+    Raises:
+        ValueError: no alternative text.
+    """
+    if not alt.strip():
+        raise ValueError(f"alt={alt!r}: expected words that stand for the picture; a figure has them from set_label")
     data = base64.b64encode(content).decode()
     return HTML(f'<img src="data:image/{kind};base64,{data}" alt="{html.escape(alt)}" style="background: white">')
 

@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import importlib.metadata
+import json
 import re
 import subprocess
 import sys
@@ -42,6 +43,7 @@ ROOMS = [
     "film",
     "widgets",
     "play_widget",
+    "environment",
     "__main__",
 ]
 FILES = sorted(PACKAGE.glob("*.py"))
@@ -150,6 +152,27 @@ def test_nothing_that_is_read_can_run_code(file):
         if isinstance(node, ast.Import | ast.ImportFrom):
             modules = [alias.name for alias in node.names] + [getattr(node, "module", None)]
             assert not {"pickle", "dill", "joblib", "shelve", "marshal"} & set(modules)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "notebooks").rglob("*.ipynb")), ids=lambda file: file.stem)
+def test_a_notebook_is_committed_without_outputs_so_that_a_diff_shows_what_changed(file):
+    text = file.read_text(encoding="utf-8")
+    notebook = json.loads(text)
+    assert text == json.dumps(notebook, indent=1, ensure_ascii=False) + "\n"
+    for cell in notebook["cells"]:
+        assert cell.get("outputs", []) == [] and cell.get("execution_count") is None, cell["id"]
+        assert not re.search(r"!\[\s*\]\(", "".join(cell["source"])), f"{cell['id']}: a picture without words"
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)
+def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
+    cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
+    ids = [cell["id"] for cell in cells]
+    assert all(re.fullmatch(file.stem[:2] + r"-\d\d", name) for name in ids) and len(set(ids)) == len(ids)
+    assert 15 <= len(cells) <= 40
+    long = [cell["id"] for cell in cells if cell["cell_type"] == "code" and len(cell["source"]) > 15]
+    assert long == []
+    assert "check_environment()" in "".join(next(cell["source"] for cell in cells if cell["cell_type"] == "code"))
 
 
 def test_ci_runs_the_one_test_command_of_the_readme():

@@ -5,10 +5,11 @@ import time
 import numpy as np
 import pytest
 from ipywidgets import FloatSlider, Image
+from matplotlib.figure import Figure
 
 from stad_lab.drives import look_inside, record_drive
 from stad_lab.plots import moving_figure, plot_moment
-from stad_lab.widgets import explore_latents, view_drive
+from stad_lab.widgets import explore_latents, show, show_film, view_drive
 
 
 def find(widget, kind):
@@ -54,3 +55,10 @@ def test_what_cannot_be_shown_is_refused(inside):
         moving_figure([], 10, "mp4")
     with pytest.raises(ValueError, match="no figures"):
         moving_figure([], 10)
+
+
+def test_a_picture_without_alternative_text_is_refused():
+    with pytest.raises(ValueError, match="alt=''"):
+        show(Figure(figsize=(1, 1)))
+    with pytest.raises(ValueError, match="alt=' '"):
+        show_film(b"GIF", " ")

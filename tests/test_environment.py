@@ -1,0 +1,111 @@
+"""The environment check: green where all is well, and a red line with its remedy, never a crash, where it is not."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+
+import numpy as np
+
+from stad_lab import check_environment, environment
+
+ROOT = Path(__file__).parent.parent
+
+
+def check_in_a_process(*options, **variables):
+    """`python -m stad_lab check` in a process of its own."""
+    command = [sys.executable, *options, "-m", "stad_lab", "check"]
+    return subprocess.run(
+        command, cwd=ROOT, env=os.environ | variables, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def line(report, name):
+    """The line of a report about `name`."""
+    return next(line for line in report.lines if line.name == name)
+
+
+def test_where_everything_is_installed_nothing_is_red(tmp_path):
+    report = check_environment(tmp_path)
+    assert report.ok, report
+    for name in ("Python", "torch", "gymnasium", "CarRacing, fast", "CarRacing, Gymnasium's", "working folder", "GPU"):
+        assert line(report, name).state == "green"
+    assert all(bool(line.remedy) == (line.state != "green") for line in report.lines)
+
+
+def test_the_command_prints_one_line_for_each_check_and_succeeds():
+    process = check_in_a_process()
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert {text.split()[0] for text in process.stdout.splitlines()[:-1]} - {"remedy:"} <= {"green", "amber"}
+    assert "everything needed is here" in process.stdout
+
+
+def test_a_library_that_does_not_load_is_a_red_line_and_the_rest_is_still_checked(tmp_path):
+    (tmp_path / "torch.py").write_text("raise OSError('libgomp.so.1: cannot open shared object file')")
+    process = check_in_a_process(PYTHONPATH=str(tmp_path))
+    assert process.returncode == 1 and process.stderr == ""
+    lines = process.stdout.splitlines()
+    broken = next(number for number, text in enumerate(lines) if "import torch" in text)
+    assert lines[broken].startswith("red") and "libgomp.so.1" in lines[broken]
+    assert "remedy: pip install -r environment.txt" in lines[broken + 1]
+    assert any(text.startswith("green  CarRacing, fast") for text in lines)
+
+
+def test_a_python_without_any_library_gets_a_report_not_a_traceback():
+    process = check_in_a_process("-S")
+    assert process.returncode == 1 and process.stderr == ""
+    assert "No module named 'numpy'" in process.stdout and "follow the remedies" in process.stdout
+
+
+def test_a_missing_package_and_a_wrong_version_are_red_with_what_is_wanted(monkeypatch):
+    installed = environment.version
+
+    def version(name):
+        if name == "cma":
+            raise PackageNotFoundError(name)
+        return {"gymnasium": "0.29.1", "box2d-py": "2.3.8"}.get(name) or installed(name)
+
+    monkeypatch.setattr(environment, "version", version)
+    report = check_environment()
+    assert not report.ok
+    assert line(report, "cma").found.startswith("missing for")
+    assert line(report, "gymnasium").found == "0.29.1, but stad_lab wants ==1.4.0"
+    assert "pip uninstall box2d-py box2d" in line(report, "box2d-py").remedy
+
+
+def test_a_black_picture_is_red(monkeypatch):
+    black = np.zeros((96, 96, 3), np.uint8)
+    monkeypatch.setattr("stad_lab.car_racing.FastCarRacing._render", lambda self, mode: black)
+    report = environment.Report(tuple(environment.check_drive()))
+    assert line(report, "CarRacing, fast").state == "red" and "black" in line(report, "CarRacing, fast").found
+    assert line(report, "CarRacing, Gymnasium's").state == "green"
+
+
+def test_a_working_folder_that_is_missing_or_read_only_is_red(tmp_path, monkeypatch):
+    def refuse(dir):
+        raise PermissionError(f"[Errno 13] Permission denied: '{dir}'")
+
+    missing = line(check_environment(tmp_path / "missing"), "working folder")
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    closed = line(check_environment(tmp_path), "working folder")
+    assert missing.state == closed.state == "red" and missing.remedy and closed.remedy
+    assert "there is no such folder" in missing.found and "Permission denied" in closed.found
+
+
+def test_little_room_is_amber_and_none_is_red():
+    states = [environment.graded("free disk", found, amber=3, red=1, remedy="make room").state for found in (4, 2, 0.5)]
+    assert states == ["green", "amber", "red"]
+
+
+def test_an_unknown_preset_is_red_and_names_the_presets(monkeypatch):
+    monkeypatch.setenv("STAD_LAB_SETTINGS", "lapptop")
+    (wrong,) = environment.check_settings()
+    assert wrong.state == "red" and "lapptop" in wrong.found and "quick, laptop, paper" in wrong.remedy
+
+
+def test_in_a_notebook_the_remedies_stand_open_and_all_green_is_one_folded_line():
+    green, red = environment.Line("green", "a", "1"), environment.Line("red", "b", "<2>", "do this")
+    assert environment.Report((green,))._repr_html_().startswith("<details><summary>1 green: everything")
+    page = environment.Report((green, red))._repr_html_()
+    assert page.startswith("<details open>") and "do this" in page and "&lt;2&gt;" in page
