@@ -37,8 +37,8 @@ extensions = [
     "sphinx-mathjax-offline",  # formulas without a network: it serves MathJax from the site itself
 ]
 root_doc = "docs/index"
-include_patterns = ["README.md", "docs/**", "notebooks/*.ipynb", "notebooks/exercises/README.md"]
-exclude_patterns = ["docs/_*", ".*", "runs", "**/.ipynb_checkpoints"]
+include_patterns = ["README.md", "docs/**", "notebooks/*.ipynb", "notebooks/exercises/*.*"]
+exclude_patterns = ["docs/_*", ".*", "runs", "**/.ipynb_checkpoints", "notebooks/exercises/*.py"]
 templates_path = [str(HERE / "_templates")]
 suppress_warnings = ["myst.header"]  # a notebook's markdown cell may begin a step at the second level
 
@@ -46,6 +46,7 @@ suppress_warnings = ["myst.header"]  # a notebook's markdown cell may begin a st
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # on busy cores, threads that wait for each other slow PyTorch manyfold
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(HERE / "_cache" / f"{Settings.preset().name}-{digest(PACKAGE)}")
+nb_execution_excludepatterns = ["notebooks/exercises/*"]  # their answers are missing, and they say so
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_ipywidgets_js = {}  # widgets need a kernel, and their scripts a network: see explain_widgets

@@ -95,7 +95,6 @@ class Session:
         hand: whose `held` keys drive while the driver is "hand".
         track: seed of the present track.
         score: return of the real episode so far.
-        ended: whether the episode of the present world is over; `begin` another, or `enter` the other world.
         earlier: the last four episodes before this one, as (track, Drive), newest last.
 
     Args:
@@ -132,7 +131,7 @@ class Session:
 
     @property
     def ended(self) -> bool:
-        """Whether the episode of the present world is over."""
+        """Whether the episode of the present world is over; `begin` another, or `enter` the other world."""
         return self.real_ended if self.world == "real" else self.dream_ended
 
     def give(self, driver: str) -> None:

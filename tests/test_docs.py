@@ -40,7 +40,7 @@ def site(tmp_path_factory):
     out = source / "docs" / "_build" / "site"
     (source / "conf.py").write_text(
         f"import sys\nsys.path.insert(0, {str(ROOT / 'docs')!r})\nfrom conf import *\n"
-        f"nb_execution_excludepatterns = ['notebooks/[0-9]*']\nnb_execution_cache_path = {str(source / 'cache')!r}\n"
+        f"nb_execution_excludepatterns += ['notebooks/[0-9]*']\nnb_execution_cache_path = {str(source / 'cache')!r}\n"
     )
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", source, out]
     return out, subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)

@@ -244,12 +244,15 @@ def kill_at_random(stage, run, tmp_path, kills):
         before = STAGES.index(stage)
         while before:  # every stage before it says that there is nothing to do
             before -= process.stdout.readline().endswith(b"nothing to do\n")
-        time.sleep(rng.uniform(0, duration))
-        process.kill()
-        if process.wait() == -signal.SIGKILL:
-            killed += 1
-        else:  # it was done already: from the start
+        begin = time.perf_counter()
+        try:
+            process.wait(rng.uniform(0, duration))
+            duration = time.perf_counter() - begin  # it was done already, so it is quicker now: from the start
             folder = start_of(stage, run, tmp_path / f"run{killed}-{rng.random()}")
+        except subprocess.TimeoutExpired:
+            process.kill()
+            killed += 1
+        process.wait()
     subprocess.run(stage_command(folder, stage), check=True, capture_output=True, timeout=300)
     return folder
 
