@@ -236,7 +236,7 @@ if "folder" not in globals():
 settings = Settings.preset("quick", processes=1, generations=400, max_frames=30, hidden_size=256)
 def draw(log):
     return plot_evolution(fitness_curves(log), {}, f"generation {len(log)}")
-watch_training(lambda watch: evolve("input", settings, folder, watch), draw)
+watch_training(lambda watch: evolve("input", settings, folder, watch=watch), draw)
 """
 
 
