@@ -130,9 +130,8 @@ def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
     Args:
         z: where the sliders begin, float32 (latent_size,).
     """
-    pictures = [
-        ipywidgets.Image(format="png", width=224, height=224) for _ in range(1 + autoencoder.redraws_difference)
-    ]
+    names = ["frame", "difference image"][: 1 + autoencoder.redraws_difference]
+    pictures = [ipywidgets.HTML() for _ in names]
     sliders = [
         ipywidgets.FloatSlider(
             round(float(value), 2), min=-4, max=4, step=0.05, description=f"z[{number}]", readout_format=".1f"
@@ -141,8 +140,9 @@ def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
     ]
 
     def redraw(_change=None) -> None:
-        for picture, drawn in zip(pictures, draw_latents(autoencoder, [s.value for s in sliders]), strict=True):
-            picture.value = drawn
+        drawn = draw_latents(autoencoder, [control.value for control in sliders])
+        for picture, name, content in zip(pictures, names, drawn, strict=True):
+            picture.value = show_picture(content, "png", f"the {name} that V draws from these latents").data
 
     for control in sliders:
         control.layout.width = "230px"

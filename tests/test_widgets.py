@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from ipywidgets import FloatSlider, Image
+from ipywidgets import HTML, FloatSlider
 from matplotlib.figure import Figure
 
 from stad_lab.drives import look_inside, record_drive
@@ -28,7 +28,7 @@ def inside(agent):
 
 def test_the_latent_explorer_has_a_slider_for_each_latent_and_redraws_in_less_than_100_ms(agent):
     explorer = explore_latents(agent.autoencoder, np.zeros(32, np.float32))
-    sliders, pictures = find(explorer, FloatSlider), find(explorer, Image)
+    sliders, pictures = find(explorer, FloatSlider), find(explorer, HTML)
     assert len(sliders) == 32 and len(pictures) == 2
     seconds = []
     for number in range(9):
