@@ -456,7 +456,7 @@ def train_m(plain: bool, seed: int, steps: int = M_STEPS, batch: int | None = No
 
 
 def measure_cluster(rounds: int) -> dict:
-    """A generation of 16 agents on 4 tracks, 250 frames each, by own processes and by Dask workers on this machine.
+    """A generation of 16 agents on 4 tracks, 100 frames each, by own processes and by Dask workers on this machine.
 
     A second table holds what the arithmetic of `project` needs, a third what it gives.
     """
@@ -465,7 +465,7 @@ def measure_cluster(rounds: int) -> dict:
 
     from stad_lab.cluster import cluster
 
-    settings, agent = Settings.preset("laptop", max_frames=250, patience=0), load_agent(VARIANT)
+    settings, agent = Settings.preset("laptop", max_frames=100, patience=0), load_agent(VARIANT)
     agents = np.repeat(agent.parameters[None], settings.population * settings.tracks, axis=0)
     address = {"threads_per_worker": 1, "dashboard_address": None}
     with (

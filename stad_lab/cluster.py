@@ -21,13 +21,16 @@ class ClusterExecutor(ClientExecutor):
     """Dask's executor, which does the work of a lost worker again; and with a way to share something large."""
 
     def share(self, value: Any) -> Future:
-        """A stand-in for `value` in the arguments of tasks: every worker that needs it gets it once.
+        """A stand-in for `value` in the arguments of tasks: every worker gets it once.
 
         It is the result of a task, not data that was put there, so it comes back if the workers that held it are lost.
+        All workers get it at once, because Dask prefers to send a task to where its arguments are.
         """
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sending large graph")  # once for each run, not for each task
-            return self._client.submit(itself, value, pure=False)
+            stand_in = self._client.submit(itself, value, pure=False)
+        self._client.replicate([stand_in])
+        return stand_in
 
 
 def itself(value: Any) -> Any:
