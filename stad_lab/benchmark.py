@@ -22,6 +22,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Executor, ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import gymnasium as gym
@@ -265,9 +266,7 @@ def make_world_models_sizes(folder: Path) -> None:
     shutil.copyfile(PRETRAINED / VARIANT / "mdn_rnn.safetensors", folder / "mdn_rnn.safetensors")
 
 
-def parallel_speed(
-    executor: Executor, folder: Path, agents: np.ndarray, tracks: list[int], settings: Settings
-) -> float:
+def parallel_speed(executor: Executor, folder: Any, agents: np.ndarray, tracks: list[int], settings: Settings) -> float:
     """Frames a second of all agents together, each on its track."""
     begin = time.perf_counter()
     _, lengths = drive_parallel(executor, folder, VARIANT, agents, tracks, settings)
@@ -477,16 +476,15 @@ def measure_cluster(rounds: int) -> dict:
         cluster(large.scheduler_address) as dask_two,
     ):
 
-        def generation(executor: Executor, number: int) -> float:
+        def generation(executor: Executor, source: Any, number: int) -> float:
             tracks = track_seeds("evolve", settings.tracks, 9, number) * settings.population
-            source = hand_out(executor, PRETRAINED / VARIANT, VARIANT)
             return parallel_speed(executor, source, agents, tracks, settings)
 
+        executors = {"own processes, 1": one, "own processes, 2": two}
+        executors |= {"Dask, 1 worker": dask_one, "Dask, 2 workers": dask_two}
         contenders = {
-            "own processes, 1": lambda number: generation(one, number),
-            "own processes, 2": lambda number: generation(two, number),
-            "Dask, 1 worker": lambda number: generation(dask_one, number),
-            "Dask, 2 workers": lambda number: generation(dask_two, number),
+            name: functools.partial(generation, executor, hand_out(executor, PRETRAINED / VARIANT, VARIANT))
+            for name, executor in executors.items()
         }
         for contender in contenders.values():
             contender(rounds)

@@ -32,7 +32,7 @@ from stad_lab.agent import (
 from stad_lab.checkpoints import load_json, locked, save_json
 from stad_lab.controller import initial_parameters
 from stad_lab.mdn_rnn import check_partner
-from stad_lab.parallel import return_freed_memory, run_tasks, use_one_thread, worker_processes
+from stad_lab.parallel import return_freed_memory, run_tasks, work_alone, worker_processes
 from stad_lab.rollouts import track_seeds
 from stad_lab.settings import Settings, check_same_run
 
@@ -256,7 +256,7 @@ def drive_group(
     limits: Settings | None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a worker process does: load V and M once, drive a group of cars in step."""
-    use_one_thread()
+    work_alone()
     world_model = source if isinstance(source, WorldModel) else load_world_model(source, variant)
     autoencoder, mdn_rnn, stride, crop_bar, _ = world_model
     agent = Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)

@@ -223,14 +223,17 @@ def peak_memory() -> dict[str, float] | None:
 
 def start_worker() -> None:
     """Prepare a worker process."""
-    keep_freed_memory()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    use_one_thread()
+    work_alone()
     threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-def use_one_thread() -> None:
-    """Compute on one thread from now on: the cores are kept busy by tasks, and last bits depend on the threads."""
+def work_alone() -> None:
+    """Compute on one thread from now on: the cores are kept busy by tasks, and last bits depend on the threads.
+
+    Tasks call it, so that it holds for any executor's workers.
+    """
+    keep_freed_memory()
     if torch.get_num_threads() != 1:
         torch.set_num_threads(1)
     cv2.setNumThreads(1)

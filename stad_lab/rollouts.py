@@ -20,7 +20,7 @@ from tqdm.auto import tqdm
 from stad_lab.car_racing import make_env, place_car
 from stad_lab.checkpoints import checksum, load_json, locked, read_bytes, save_json, write_bytes
 from stad_lab.frames import FRAME_SIZE, earlier_index, to_frame
-from stad_lab.parallel import run_tasks, use_one_thread, worker_processes
+from stad_lab.parallel import run_tasks, work_alone, worker_processes
 from stad_lab.settings import Settings
 
 # Tracks are named by the seed of `env.reset`. The uses never share one: an agent is reported on tracks that nothing was
@@ -95,7 +95,7 @@ def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarr
 
     `actions[t]` is what the driver does on seeing `frames[t]`. Runs in a worker process.
     """
-    use_one_thread()
+    work_alone()
     env, observation, driver = begin_randomly(settings, index)
     frames, actions = [], []
     for _ in range(settings.episode_frames):
