@@ -6,15 +6,16 @@ from pathlib import Path
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
 README = (Path(__file__).parent.parent / "README.md").read_text()
+CLUSTER = (Path(__file__).parent.parent / "docs" / "cluster.md").read_text()
 
 
 def read(name):
     return json.loads((RECORDS / name).read_text())
 
 
-def cells(label):
-    """The cells of README's table row with this label."""
-    row = re.search(rf"^\| {re.escape(label)} \|(.*)\|$", README, re.M)
+def cells(label, page=README):
+    """The cells of a page's table row with this label."""
+    row = re.search(rf"^\| {re.escape(label)} \|(.*)\|$", page, re.M)
     assert row, label
     return [cell.strip() for cell in row.group(1).split("|")]
 
@@ -36,3 +37,19 @@ def test_the_readme_s_probe_is_the_study_s():
         if "z, h" in found:
             values = [f"{z} ({r2['r2']:.2f})" for z, r2 in zip(values, found["z, h"].values(), strict=True)]
         assert cells(", ".join([f"z of `{name}`", *untrained])) == values
+
+
+def test_the_cluster_page_says_what_the_record_says():
+    result = read("cluster.json")["cluster"]
+    for name, value in result["frames a second, a generation"].items():
+        assert cells(name, CLUSTER) == [f"{value['median']:,.0f}", f"{value['ratio']:.2f}"]
+    costs, efficiency = result["costs"], result["projected efficiency, 1,024 episodes of 1,000 frames"]
+    for number in (
+        f"{costs['frames a second, 16 in step']:.0f}",
+        f"{costs['frames a second, 1 car in a process']:.0f}",
+        f"{costs['milliseconds of Dask for a task']:.1f} ms",
+        f"{costs['milliseconds of CMA-ES for a generation of 64']:.0f} ms",
+        f"{100 * efficiency['64 workers']:.0f}%",
+        f"{100 * efficiency['1,024 workers']:.0f}%",
+    ):
+        assert re.search(rf"(?<![\d.,]){re.escape(number)}", CLUSTER), number
