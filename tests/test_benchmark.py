@@ -61,5 +61,7 @@ def test_the_command_writes_every_measurement(tmp_path, command_line):
 
 @pytest.mark.parametrize(("parts", "rounds"), [(["speed"], 5), (["parity"], 0)])
 def test_an_unknown_part_or_no_round_is_refused(parts, rounds):
-    with pytest.raises(ValueError, match=r"choose from parity, renderer, loop, training, cluster, with 1 round or more"):
+    with pytest.raises(
+        ValueError, match=r"choose from parity, renderer, loop, training, cluster, with 1 round or more"
+    ):
         benchmark(parts, rounds)

@@ -1,12 +1,11 @@
 """Evaluation: official tracks, every episode on record, numbers that a script of one's own finds again."""
 
-import json
-
 import gymnasium
 import numpy as np
 import pytest
 
 from stad_lab import load_agent
+from stad_lab.checkpoints import load_json
 from stad_lab.evaluation import describe, evaluate, summarise
 from stad_lab.rollouts import TRACK_RANGES
 
@@ -53,7 +52,7 @@ def test_an_evaluation_goes_to_the_screen_and_to_a_file(quick_run, fast, tmp_pat
     arguments = ["evaluate", "--variant", "input_output", "--path", quick_run, "--fast", "--episodes", 5]
     process = command_line(*arguments, "--first-track", 10, "--processes", 1, "--json", tmp_path / "result.json")
     assert process.returncode == 0, process.stderr
-    result = json.loads((tmp_path / "result.json").read_text())
+    result = load_json(tmp_path / "result.json")
     assert result | {"seconds": 0} == fast | {"seconds": 0}  # one process or two: the same numbers
     assert result["seconds"] > 0
     assert describe(fast) in process.stdout

@@ -6,8 +6,8 @@ import shutil
 import numpy as np
 import pytest
 
-from stad_lab.agent import run_folder
-from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder
+from stad_lab.agent import read_world_model, run_folder
+from stad_lab.autoencoder import VARIANTS, AutoEncoder
 from stad_lab.checkpoints import load_json
 from stad_lab.drives import MOTION, record_random_drive
 from stad_lab.settings import Settings
@@ -48,10 +48,10 @@ def test_the_command_measures_m_against_simple_forecasts_and_lesser_m_s(measured
 
 def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_run):
     folder = measured[0]
-    autoencoder, _ = load_autoencoder(run_folder("input") / "autoencoder.safetensors", "input")
+    world_model = read_world_model(run_folder("input"), "input")
     rng = np.random.default_rng(0)
     z, actions = rng.standard_normal((4, 20, 32), np.float32), rng.random((4, 20, 3), np.float32)
-    arguments = (Settings.preset("quick"), quick_run / "rollouts", folder, autoencoder, z, actions)
+    arguments = (Settings.preset("quick"), quick_run / "rollouts", folder, world_model, z, actions)
     first = lesser_forecasts(*arguments)
     kept = (folder / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns
     shutil.rmtree(folder / "no_memory")  # as if it had been stopped before
