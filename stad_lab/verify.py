@@ -4,6 +4,7 @@ The same seed, settings, versions and processor give equal bits in every stage. 
 again to the same return, and a log of CMA-ES can be told again to the same mean.
 """
 
+import functools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
@@ -42,10 +43,11 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
     folder = Path(folder)
     record = load_json(folder / "record.json", "give the folder of a run, as `python -m stad_lab train --out` makes it")
     variant, settings = record["variant"], Settings.from_dict(record["settings"])
+    read_rollouts = functools.cache(Rollouts)  # it checks every block, and a dataset may have 12 GB: once is enough
     checks: dict[str, Callable[[], str]] = {
         "record": lambda: f"ok: {variant}, {settings.name} settings",
-        "rollouts": lambda: verify_rollouts(folder / "rollouts"),
-        "V": lambda: verify_autoencoder(folder, variant, settings),
+        "rollouts": lambda: verify_rollouts(folder / "rollouts", read_rollouts),
+        "V": lambda: verify_autoencoder(folder, variant, settings, read_rollouts),
         "M": lambda: verify_mdn_rnn(folder, variant, settings),
         "log of CMA-ES": lambda: verify_log(folder, variant, settings),
         "C": lambda: verify_controller(folder, variant, settings),
@@ -79,22 +81,24 @@ def other_machine(made_with: dict) -> str:
     )
 
 
-def verify_rollouts(folder: Path) -> str:
+def verify_rollouts(folder: Path, read_rollouts: Callable[[Path], Rollouts]) -> str:
     """Check every block against the manifest."""
     if not folder.is_dir():
         return f"none: {NOT_HERE}"
-    rollouts = Rollouts(folder)
+    rollouts = read_rollouts(folder)
     return f"ok: {len(rollouts.frames)} episodes, {len(rollouts)} frames"
 
 
-def verify_autoencoder(folder: Path, variant: str, settings: Settings) -> str:
+def verify_autoencoder(
+    folder: Path, variant: str, settings: Settings, read_rollouts: Callable[[Path], Rollouts]
+) -> str:
     """Check V, its settings, and that it has seen these rollouts."""
     path = folder / "autoencoder.safetensors"
     if not path.exists():
         return f"none: {NOT_HERE}"
     _, facts = load_autoencoder(path, variant)
     check_facts(path, facts, settings)
-    if (folder / "rollouts").is_dir() and facts["rollouts"] not in (None, Rollouts(folder / "rollouts").identity):
+    if (folder / "rollouts").is_dir() and facts["rollouts"] not in (None, read_rollouts(folder / "rollouts").identity):
         raise ValueError(f"{path} was trained on other rollouts than those in {folder / 'rollouts'}")
     return "ok"
 
