@@ -13,9 +13,8 @@ import zlib
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import cma
 import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
@@ -35,6 +34,9 @@ from stad_lab.mdn_rnn import check_partner
 from stad_lab.parallel import return_freed_memory, run_tasks, work_alone, worker_processes
 from stad_lab.rollouts import track_seeds
 from stad_lab.settings import Settings, check_same_run
+
+if TYPE_CHECKING:
+    import cma
 
 LOG = "evolution.json"
 CONTROLLER = "controller.safetensors"
@@ -100,7 +102,7 @@ def evolve(
 
 def resume(
     variant: str, settings: Settings, folder: Path, log: dict, world_model: WorldModel, kept: int | None
-) -> cma.CMAEvolutionStrategy:
+) -> "cma.CMAEvolutionStrategy":
     """The strategy as the log left it; makes `controller.safetensors` again if it was lost, or is not yet the best."""
     latent_size, hidden_size = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
     start = initial_parameters(latent_size, hidden_size, settings.initial_gas)
@@ -160,8 +162,10 @@ def keep_controller(variant: str, folder: Path, log: dict, mean: np.ndarray, wor
     save_controller(folder / CONTROLLER, mean, variant=variant, **log["best"], **world_model.identities)
 
 
-def make_strategy(start: np.ndarray, settings: Settings) -> cma.CMAEvolutionStrategy:
+def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStrategy":
     """pycma's strategy with a random source of its own, so that nothing else can disturb it."""
+    import cma  # takes two seconds, and the workers that drive have no use for it
+
     rng = np.random.default_rng([settings.seed, 3])
     options = {
         "popsize": settings.population,
@@ -173,7 +177,7 @@ def make_strategy(start: np.ndarray, settings: Settings) -> cma.CMAEvolutionStra
     return cma.CMAEvolutionStrategy(start, settings.sigma, options)
 
 
-def replay(start: np.ndarray, settings: Settings, generations: list[dict]) -> cma.CMAEvolutionStrategy:
+def replay(start: np.ndarray, settings: Settings, generations: list[dict]) -> "cma.CMAEvolutionStrategy":
     """A strategy that has been told all logged generations: the full state of the interrupted run.
 
     Raises:

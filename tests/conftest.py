@@ -5,6 +5,8 @@ import os
 os.environ.setdefault("STAD_LAB_SETTINGS", "quick")
 os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")  # a GPU does not repeat its sums bit for bit
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # check_env tries render_mode="human": no window may open
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels and commands too: the cores are shared by several tests
+os.environ.setdefault("TQDM_MININTERVAL", "1")  # a kernel's messages that nobody has read yet are dropped after 1,000
 
 import subprocess
 import sys

@@ -2,12 +2,8 @@
 
 import importlib.util
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
@@ -18,7 +14,6 @@ COURSE = Path(__file__).parent.parent / "notebooks" / "exercises"
 NAMES = sorted(folder.name for folder in (COURSE / "source").iterdir())
 SOURCES = {name: COURSE / "source" / name / f"{name}.ipynb" for name in NAMES}
 NOTEBOOKS = [*SOURCES.values(), *(COURSE / f"{name}.ipynb" for name in NAMES)]
-ENVIRONMENT = os.environ | {"PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
 
 
 def read_cells(path):
@@ -31,31 +26,30 @@ def grading(cell):
     return cell["metadata"].get("nbgrader", {"grade": False, "solution": False, "grade_id": None})
 
 
-def run_nbgrader(root, *arguments):
-    """Run the real nbgrader in the course at `root`."""
-    command = [sys.executable, "-m", "nbgrader", *arguments]
-    environment = ENVIRONMENT | {"OMP_NUM_THREADS": "1"}
-    process = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=900, env=environment)
-    assert process.returncode == 0, process.stderr[-3000:]
-
-
-def grade(root, name):
-    """Make an assignment, hand in its solution and its empty stub, and have both graded."""
-    shutil.copytree(SOURCES[name].parent, root / "source" / name)
-    shutil.copy(COURSE / "nbgrader_config.py", root)
-    run_nbgrader(root, "generate_assignment", name)
-    for student, work in {"solution": "source", "stub": "release"}.items():
-        shutil.copytree(root / work / name, root / "submitted" / student / name)
-    run_nbgrader(root, "autograde", name, "--create")
-    return root
+@pytest.fixture(scope="module")
+def generator():
+    """The module notebooks/exercises/generate.py."""
+    spec = importlib.util.spec_from_file_location("generate", COURSE / "generate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture(scope="module")
-def courses(tmp_path_factory):
-    """Assignment -> the folder of a course in which it has been made, handed in twice and graded."""
-    roots = [tmp_path_factory.mktemp(name) for name in NAMES]
-    with ThreadPoolExecutor(2) as executor:
-        return dict(zip(NAMES, executor.map(grade, roots, NAMES), strict=True))
+def root(generator, tmp_path_factory):
+    """The folder of a course: each assignment was made, handed in as its solution and as its empty stub, and graded."""
+    root = tmp_path_factory.mktemp("course")
+    shutil.copytree(COURSE / "source", root / "source")
+    shutil.copy(COURSE / "nbgrader_config.py", root)
+    course = generator.load_course(root)
+    for name in NAMES:
+        made = course.generate_assignment(name)
+        assert made["success"], made["log"]
+        for student, work in {"solution": "source", "stub": "release"}.items():
+            shutil.copytree(root / work / name, root / "submitted" / student / name)
+            graded = course.autograde(name, student)
+            assert graded["success"], graded["log"]
+    return root
 
 
 def scores(root, name, student):
@@ -66,8 +60,8 @@ def scores(root, name, student):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_autograde_gives_the_solution_full_marks_and_the_stub_none(courses, name):
-    root, cells = courses[name], [grading(cell) for cell in read_cells(SOURCES[name])]
+def test_autograde_gives_the_solution_full_marks_and_the_stub_none(root, name):
+    cells = [grading(cell) for cell in read_cells(SOURCES[name])]
     graded = [cell["grade_id"] for cell in cells if cell["grade"] and not cell["solution"]]
     full = scores(root, name, "solution")
     assert {cell: full[cell][0] for cell in graded} == {cell: full[cell][1] for cell in graded}
@@ -76,8 +70,8 @@ def test_autograde_gives_the_solution_full_marks_and_the_stub_none(courses, name
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_every_cell_of_the_solution_runs(courses, name):
-    notebook = json.loads((courses[name] / "autograded" / "solution" / name / f"{name}.ipynb").read_text())
+def test_every_cell_of_the_solution_runs(root, name):
+    notebook = json.loads((root / "autograded" / "solution" / name / f"{name}.ipynb").read_text())
     outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
     assert [output["evalue"] for output in outputs if output["output_type"] == "error"] == []
     pictures = [output["data"]["text/html"] for output in outputs if "text/html" in output.get("data", {})]
@@ -86,16 +80,13 @@ def test_every_cell_of_the_solution_runs(courses, name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_student_version_is_what_nbgrader_makes_of_the_source(courses, name):
-    made, committed = courses[name] / "release" / name / f"{name}.ipynb", COURSE / f"{name}.ipynb"
+def test_the_student_version_is_what_nbgrader_makes_of_the_source(root, name):
+    made, committed = root / "release" / name / f"{name}.ipynb", COURSE / f"{name}.ipynb"
     assert json.loads(made.read_text()) == json.loads(committed.read_text()), "run notebooks/exercises/generate.py"
 
 
-def test_one_command_makes_all_student_versions(courses, tmp_path):
-    spec = importlib.util.spec_from_file_location("generate", COURSE / "generate.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    made = module.generate(tmp_path)
+def test_one_command_makes_all_student_versions(generator, tmp_path):
+    made = generator.generate(tmp_path)
     assert [path.stem for path in made] == NAMES
     assert all(path.read_text() == (COURSE / path.name).read_text() for path in made)
 
