@@ -50,10 +50,12 @@ def show_picture(content: bytes, kind: str, alt: str) -> HTML:
 def show_source(*things: Callable) -> HTML:
     """The source code of functions or classes, as it runs, in colour."""
     source = "\n\n".join(inspect.getsource(thing).rstrip() for thing in things)
+    # Paper and ink of its own: in a dark theme, JupyterLab would put dark paper under the dark ink.
+    paper = "background: #f8f8f8; color: black"
     page = HtmlFormatter(
         noclasses=True,
-        cssstyles="padding: 4px 10px; border-left: 3px solid #0072B2",
-        prestyles="font-family: monospace; color: black",
+        cssstyles=f"{paper}; padding: 4px 10px; border-left: 3px solid #0072B2",
+        prestyles=f"{paper}; font-family: monospace",
     )
     return HTML(highlight(source, PythonLexer(), page))
 

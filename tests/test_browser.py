@@ -37,14 +37,15 @@ def lab(tmp_path_factory):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    quiet = {"fetchNews": "false", "checkForUpdates": False}
+    quiet, dark = {"fetchNews": "false", "checkForUpdates": False}, {"theme": "JupyterLab Dark"}
     places = {f"JUPYTER_{kind}_DIR": str(folder / kind) for kind in ("CONFIG", "RUNTIME")} | {"OMP_NUM_THREADS": "1"}
     command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", f"--port={port}", "--ip=127.0.0.1"]
     command += ["--IdentityProvider.token=t", f"--ServerApp.root_dir={folder}", "--ServerApp.port_retries=0"]
     command += ["--LabApp.extension_manager=readonly"]
     settings = folder / "CONFIG" / "labconfig" / "default_setting_overrides.json"
     settings.parent.mkdir(parents=True)
-    settings.write_text(json.dumps({"@jupyterlab/apputils-extension:notification": quiet}))
+    extension = "@jupyterlab/apputils-extension"
+    settings.write_text(json.dumps({f"{extension}:notification": quiet, f"{extension}:themes": dark}))
     with (folder / "server.log").open("w") as log:
         server = subprocess.Popen(
             command,
@@ -163,6 +164,23 @@ def test_a_moved_slider_draws_another_figure_in_every_widget_that_has_one(run):
         for place in range(pictures):
             picture = cell.locator(".jp-OutputArea-output img").nth(place)
             sees_another_picture(picture, lambda handles=handles: handles.first.press("ArrowRight"))
+
+
+SOURCE = """
+from stad_lab.frames import difference_image
+from stad_lab.widgets import show_source
+show_source(difference_image)
+"""
+LIGHTS = """pre => [getComputedStyle(pre).backgroundColor, ...Array.from(pre.querySelectorAll("span"))
+    .filter(part => part.textContent.trim()).map(part => getComputedStyle(part).color)].map(color => color.match(/\\d+/g).slice(0, 3).map(Number))"""
+
+
+def test_source_code_can_be_read_in_the_dark_theme(run):
+    page = run(SOURCE)
+    paper, *inks = page.locator(".jp-OutputArea-output pre").last.evaluate(LIGHTS, timeout=1000 * SLOW)
+    assert page.locator("body").get_attribute("data-jp-theme-light") == "false"
+    assert min(paper) > 240 and len(inks) > 20
+    assert max(sum(ink) / 3 for ink in inks) < 175
 
 
 SEAT = """
