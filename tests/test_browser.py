@@ -171,8 +171,11 @@ from stad_lab.frames import difference_image
 from stad_lab.widgets import show_source
 show_source(difference_image)
 """
-LIGHTS = """pre => [getComputedStyle(pre).backgroundColor, ...Array.from(pre.querySelectorAll("span"))
-    .filter(part => part.textContent.trim()).map(part => getComputedStyle(part).color)].map(color => color.match(/\\d+/g).slice(0, 3).map(Number))"""
+LIGHTS = r"""pre => {
+    const inked = Array.from(pre.querySelectorAll("span")).filter(part => part.textContent.trim())
+    const colors = [getComputedStyle(pre).backgroundColor, ...inked.map(part => getComputedStyle(part).color)]
+    return colors.map(color => color.match(/[0-9]+/g).slice(0, 3).map(Number))
+}"""
 
 
 def test_source_code_can_be_read_in_the_dark_theme(run):
