@@ -21,7 +21,6 @@ from stad_lab.autoencoder import VARIANTS
 from stad_lab.benchmark import PARTS, benchmark
 from stad_lab.checkpoints import check_writable, load_json, save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
-from stad_lab.film import film_agent, film_viewer
 from stad_lab.parallel import TaskError
 from stad_lab.pipeline import STAGES, ship, train
 from stad_lab.settings import PRESETS, Settings
@@ -215,6 +214,8 @@ def main(arguments: list[str] | None = None) -> int:
         elif options.command == "ship":
             print(f"shipped to {ship(options.variant, options.path)}")
         elif options.command == "film":
+            from stad_lab.film import film_agent, film_viewer  # matplotlib takes a second, and workers import this file
+
             agent = load_agent(options.variant, options.path)
             shown = (agent, options.track, options.first, options.frames)
             kind = options.out.suffix.lstrip(".").lower()

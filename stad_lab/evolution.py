@@ -164,7 +164,7 @@ def keep_controller(variant: str, folder: Path, log: dict, mean: np.ndarray, wor
 
 def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStrategy":
     """pycma's strategy with a random source of its own, so that nothing else can disturb it."""
-    import cma  # takes two seconds, and the workers that drive have no use for it
+    import cma  # here, because it takes two seconds, and the workers that drive have no use for it
 
     rng = np.random.default_rng([settings.seed, 3])
     options = {

@@ -8,8 +8,6 @@ use.
 """
 
 import numpy as np
-from sklearn.linear_model import Ridge
-from sklearn.preprocessing import StandardScaler
 
 PENALTIES = np.logspace(-1, 5, 7)  # of the ridge, for features of variance 1
 HELDOUT = 0.4  # share of the drives on which R2 is measured
@@ -59,6 +57,10 @@ def fit_ridge(
     features: np.ndarray, targets: np.ndarray, fit: np.ndarray, penalty: float | np.ndarray, shown: np.ndarray
 ) -> np.ndarray:
     """Fit a ridge regression on the rows `fit`, and predict the targets of the rows `shown`: (rows, targets)."""
+    # Here, because it takes a second, and every command and every worker process imports this room.
+    from sklearn.linear_model import Ridge
+    from sklearn.preprocessing import StandardScaler
+
     scaler = StandardScaler().fit(features[fit])
     ridge = Ridge(penalty).fit(scaler.transform(features[fit]), targets[fit])
     return ridge.predict(scaler.transform(features[shown])).reshape(-1, targets.shape[1])
