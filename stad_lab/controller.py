@@ -23,6 +23,12 @@ def initial_parameters(latent_size: int, hidden_size: int, gas: float = 0.0) -> 
     return parameters
 
 
+def seen_parameters(features: str, latent_size: int, hidden_size: int) -> np.ndarray:
+    """Which parameters act on what C sees, for `Settings.features`: bool (parameters,). The others stay zero."""
+    columns = np.repeat(["z" in features, "h" in features], [latent_size, hidden_size])
+    return np.concatenate([np.tile(columns, ACTION_SIZE), np.ones(ACTION_SIZE, bool)])
+
+
 def check_parameters(parameters: np.ndarray, count: int, source: str | Path = "controller") -> None:
     """Raise ValueError unless `parameters` is one finite vector of `count`, or a stack of them (cars, count)."""
     if parameters.ndim not in (1, 2) or parameters.shape[-1] != count:

@@ -29,7 +29,7 @@ from stad_lab.agent import (
     save_controller,
 )
 from stad_lab.checkpoints import load_json, locked, save_json
-from stad_lab.controller import initial_parameters
+from stad_lab.controller import initial_parameters, seen_parameters
 from stad_lab.mdn_rnn import check_partner
 from stad_lab.parallel import return_freed_memory, run_tasks, work_alone, worker_processes
 from stad_lab.rollouts import track_seeds
@@ -52,8 +52,8 @@ def evolve(
     """Evolve C for the V and M in `folder`; writes `evolution.json` after every generation and the best C found.
 
     Every agent of a generation drives the same few tracks; its fitness is its mean return. From time to time the mean
-    of the search distribution drives the validation tracks, and the best such mean is kept as `controller.safetensors`:
-    choosing the best *agent* instead would choose the luckiest.
+    of the search distribution, or the average of its last means, drives the validation tracks, and the best one so far
+    is kept as `controller.safetensors`: choosing the best *agent* instead would choose the luckiest.
 
     Args:
         executor: who drives; None for `settings.processes` processes of this machine.
@@ -77,22 +77,25 @@ def evolve(
     if log["best"] and kept == log["best"]["generation"] and len(log["generations"]) >= settings.generations:
         return False
     with locked(folder), threadpool_limits(1), worker_processes(settings.processes, executor) as executor:
-        strategy = resume(variant, settings, folder, log, world_model, kept)
+        seen = seen_parameters(settings.features, *sizes(world_model))
+        strategy, means = resume(variant, settings, folder, log, world_model, kept)
         source = hand_out(executor, folder, variant)
         done = len(log["generations"])
         progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
         for generation in progress:
             population = np.array(strategy.ask())
-            entry = drive_generation(executor, source, variant, settings, generation, population)
+            entry = drive_generation(executor, source, variant, settings, generation, expand(population, seen))
             strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
+            means.append(strategy.mean.copy())
             entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
+            controller = expand(averaged_mean(means, settings), seen)
             if (generation + 1) % settings.validate_every == 0:
-                entry["validation"] = validate(executor, source, variant, settings, strategy.mean)
+                entry["validation"] = validate(executor, source, variant, settings, controller)
             log["generations"].append(entry)
             better = note_best(log)
             save_json(folder / LOG, log)
             if better:  # after the log: a controller that the log does not know would be a stranger
-                keep_controller(variant, folder, log, strategy.mean, world_model)
+                keep_controller(variant, folder, log, controller, world_model)
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
             if watch:
@@ -102,14 +105,42 @@ def evolve(
 
 def resume(
     variant: str, settings: Settings, folder: Path, log: dict, world_model: WorldModel, kept: int | None
-) -> "cma.CMAEvolutionStrategy":
-    """The strategy as the log left it; makes `controller.safetensors` again if it was lost, or is not yet the best."""
-    latent_size, hidden_size = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
-    start = initial_parameters(latent_size, hidden_size, settings.initial_gas)
+) -> tuple["cma.CMAEvolutionStrategy", list[np.ndarray]]:
+    """The strategy and its means as the log left them; makes `controller.safetensors` again if it is not the best."""
+    strategy, means = replay(start_of_search(settings, world_model), settings, log["generations"])
     if log["best"] and log["best"]["generation"] != kept:
-        best = replay(start, settings, log["generations"][: log["best"]["generation"]])
-        keep_controller(variant, folder, log, best.mean, world_model)
-    return replay(start, settings, log["generations"])
+        best = averaged_mean(means[: log["best"]["generation"]], settings)
+        seen = seen_parameters(settings.features, *sizes(world_model))
+        keep_controller(variant, folder, log, expand(best, seen), world_model)
+    return strategy, means
+
+
+def sizes(world_model: WorldModel) -> tuple[int, int]:
+    """How many numbers z and h have."""
+    return world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
+
+
+def start_of_search(settings: Settings, world_model: WorldModel) -> np.ndarray:
+    """CMA-ES's first mean: of all of C's parameters those that act on what it sees."""
+    return initial_parameters(*sizes(world_model), settings.initial_gas)[
+        seen_parameters(settings.features, *sizes(world_model))
+    ]
+
+
+def expand(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """All of C's parameters (..., parameters) from those that are searched (..., searched); the others are zero."""
+    whole = np.zeros((*parameters.shape[:-1], len(seen)))
+    whole[..., seen] = parameters
+    return whole
+
+
+def averaged_mean(means: list[np.ndarray], settings: Settings) -> np.ndarray:
+    """The average of the last `averaged_share` of the means, of one at least: the controller that a search has found.
+
+    The noise of the returns drives the mean about; what several means have in common is what was learned (Polyak's
+    averaging).
+    """
+    return np.mean(means[-max(1, round(settings.averaged_share * len(means))) :], axis=0)
 
 
 def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldModel) -> dict:
@@ -129,7 +160,7 @@ def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldM
 
 
 def kept_generation(variant: str, folder: Path, log: dict) -> int | None:
-    """The generation that `controller.safetensors` is the mean of, by the log; None if there is no such file.
+    """The generation after which `controller.safetensors` was found, by the log; None if there is no such file.
 
     Raises:
         ValueError: it is damaged, or the log does not know it.
@@ -138,7 +169,11 @@ def kept_generation(variant: str, folder: Path, log: dict) -> int | None:
     if not path.exists():
         return None
     parameters, facts = load_controller(path, variant)
-    validated = {entry["generation"]: entry["mean_checksum"] for entry in log["generations"] if "validation" in entry}
+    validated = {
+        entry["generation"]: entry["validation"]["controller_checksum"]
+        for entry in log["generations"]
+        if "validation" in entry
+    }
     generation = facts.get("generation")
     if mean_checksum(parameters) != validated.get(generation):
         raise ValueError(
@@ -149,7 +184,7 @@ def kept_generation(variant: str, folder: Path, log: dict) -> int | None:
 
 
 def note_best(log: dict) -> bool:
-    """Note in the log which mean has driven the validation tracks best; True if it is that of the last generation."""
+    """Note in the log after which generation the validation tracks were driven best; True if it is the last one."""
     last = log["generations"][-1]
     if "validation" not in last or (log["best"] and last["validation"]["mean"] <= log["best"]["validation"]):
         return False
@@ -157,9 +192,9 @@ def note_best(log: dict) -> bool:
     return True
 
 
-def keep_controller(variant: str, folder: Path, log: dict, mean: np.ndarray, world_model: WorldModel) -> None:
+def keep_controller(variant: str, folder: Path, log: dict, controller: np.ndarray, world_model: WorldModel) -> None:
     """Write C, with what it has to do with the log and with V and M."""
-    save_controller(folder / CONTROLLER, mean, variant=variant, **log["best"], **world_model.identities)
+    save_controller(folder / CONTROLLER, controller, variant=variant, **log["best"], **world_model.identities)
 
 
 def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStrategy":
@@ -177,22 +212,25 @@ def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStr
     return cma.CMAEvolutionStrategy(start, settings.sigma, options)
 
 
-def replay(start: np.ndarray, settings: Settings, generations: list[dict]) -> "cma.CMAEvolutionStrategy":
-    """A strategy that has been told all logged generations: the full state of the interrupted run.
+def replay(
+    start: np.ndarray, settings: Settings, generations: list[dict]
+) -> tuple["cma.CMAEvolutionStrategy", list[np.ndarray]]:
+    """A strategy that has been told all logged generations, the full state of the interrupted run, and all its means.
 
     Raises:
         ValueError: the state is not the logged one, because the log was changed or comes from another machine.
     """
-    strategy = make_strategy(start, settings)
+    strategy, means = make_strategy(start, settings), []
     for number, entry in enumerate(generations):
         population = strategy.ask()
         strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
+        means.append(strategy.mean.copy())
         if mean_checksum(strategy.mean) != entry["mean_checksum"]:
             raise ValueError(
                 f"replaying the log gives another mean in generation {number + 1} than the run had: the log was"
                 " changed, or made on another machine or by other versions of cma and numpy. Start in a new folder"
             )
-    return strategy
+    return strategy, means
 
 
 def mean_checksum(mean: np.ndarray) -> int:
@@ -226,13 +264,18 @@ def drive_generation(
     }
 
 
-def validate(executor: Executor, source: Any, variant: str, settings: Settings, mean: np.ndarray) -> dict:
-    """Drive the CMA mean on the validation tracks: its mean return, all returns, and the frames that it took."""
+def validate(executor: Executor, source: Any, variant: str, settings: Settings, controller: np.ndarray) -> dict:
+    """Drive a controller on the validation tracks: its mean return, all returns, the frames, and which one it was."""
     tracks = track_seeds("validate", settings.validation_tracks)  # the same ones for every seed
-    means = np.repeat(mean[None], len(tracks), axis=0)
+    copies = np.repeat(controller[None], len(tracks), axis=0)
     patient = dataclasses.replace(settings, patience=0)  # as in the final evaluation: nobody is given up on
-    returns, lengths = drive_parallel(executor, source, variant, means, tracks, patient)
-    return {"mean": float(returns.mean()), "returns": returns.tolist(), "frames": int(lengths.sum())}
+    returns, lengths = drive_parallel(executor, source, variant, copies, tracks, patient)
+    return {
+        "mean": float(returns.mean()),
+        "returns": returns.tolist(),
+        "frames": int(lengths.sum()),
+        "controller_checksum": mean_checksum(controller),
+    }
 
 
 def drive_parallel(

@@ -82,6 +82,8 @@ class Settings:
     """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
     sigma: float = 0.1
     """CMA-ES's first step size."""
+    features: str = "z, h"
+    """What C sees: "z, h", or "z" or "h" alone, to find out what each of them is worth."""
     initial_gas: float = -0.5
     """Gas output of the first controller before squashing; (tanh(-0.5) + 1) / 2 is 27% gas."""
     patience: int = 100
@@ -94,6 +96,9 @@ class Settings:
     """Generations between two looks at the CMA mean on the validation tracks."""
     validation_tracks: int = 16
     """Tracks of such a look."""
+    averaged_share: float = 0.4
+    """Share of the generations so far, the last ones, whose CMA means are averaged into the controller that is kept;
+    0 takes the last mean alone. Every mean is noisy in its own way, and their average is less so."""
 
     def __post_init__(self):
         for field in dataclasses.fields(self):
@@ -141,8 +146,10 @@ class Settings:
         return Settings(**known_fields(values))
 
 
-ZERO_ALLOWED = ("seed", "patience", "random_starts", "kl_weight", "free_bits", "difference_weight")
+NO_LESS_THAN_ZERO = ("seed", "patience", "kl_weight", "free_bits", "difference_weight", "m_steps")
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
+SHARES = ("random_starts", "averaged_share")
+FEATURES = ("z, h", "z", "h")
 
 
 def check_value(name: str, kind: type, value) -> None:
@@ -152,10 +159,12 @@ def check_value(name: str, kind: type, value) -> None:
     if type(value) is not kind:
         raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
     if kind in (int, float):
-        lowest = AT_LEAST.get(name, 0 if name in ZERO_ALLOWED else 1 if kind is int else 1e-12)
-        highest = 1.0 if name == "random_starts" else 1e12
+        lowest = AT_LEAST.get(name, 0 if name in (*NO_LESS_THAN_ZERO, *SHARES) else 1 if kind is int else 1e-12)
+        highest = 1.0 if name in SHARES else 1e12
         if not lowest <= value <= highest:
             raise ValueError(f"{name}={value!r} is out of range: expected {lowest:g} to {highest:g}")
+    if name == "features" and value not in FEATURES:
+        raise ValueError(f"features={value!r}: choose one of {', '.join(map(repr, FEATURES))}")
 
 
 def known_fields(values: dict) -> dict:
@@ -225,5 +234,6 @@ PRESETS = {
         initial_gas=0.0,
         patience=0,
         validate_every=20,
+        averaged_share=0.0,
     ),
 }

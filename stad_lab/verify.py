@@ -14,8 +14,16 @@ import numpy as np
 from stad_lab.agent import load_controller, read_world_model
 from stad_lab.autoencoder import check_facts, load_autoencoder
 from stad_lab.checkpoints import checksum, load_json
-from stad_lab.controller import initial_parameters
-from stad_lab.evolution import CONTROLLER, LOG, drive_group, kept_generation, read_log, replay, validate
+from stad_lab.evolution import (
+    CONTROLLER,
+    LOG,
+    drive_group,
+    kept_generation,
+    read_log,
+    replay,
+    start_of_search,
+    validate,
+)
 from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.pipeline import MACHINE, PACKAGES, provenance
@@ -119,9 +127,8 @@ def verify_log(folder: Path, variant: str, settings: Settings) -> str:
         return f"none: {NOT_HERE}"
     world_model = read_world_model(folder, variant)
     log = read_log(variant, settings, folder, world_model)
-    sizes = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
     try:
-        replay(initial_parameters(*sizes, settings.initial_gas), settings, log["generations"])
+        replay(start_of_search(settings, world_model), settings, log["generations"])
     except ValueError as error:
         raise NotRepeated(error) from error
     return f"ok: {len(log['generations'])} generations lead to the same mean"
