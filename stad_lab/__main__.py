@@ -63,6 +63,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--out", required=True, type=Path, help="folder of the run, for example runs/input")
     command.add_argument("--rollouts", type=Path, help="folder of the rollouts, to share them; default OUT/rollouts")
+    command.add_argument(
+        "--earlier",
+        type=Path,
+        metavar="RUN",
+        help="a second round: this run's agent drives agent_episodes for the rollouts, and C goes on from its C",
+    )
     command.add_argument("--until", default=STAGES[-1], help=f"last stage to run: {', '.join(STAGES)}; default all")
     command.add_argument(
         "--set",
@@ -183,7 +189,8 @@ def main(arguments: list[str] | None = None) -> int:
         elif options.command == "train":
             settings = changed_settings(options.settings, options.set)
             with drivers(options.scheduler) as executor:
-                worked = train(options.variant, settings, options.out, options.rollouts, options.until, executor)
+                chosen = (options.variant, settings, options.out, options.rollouts, options.until)
+                worked = train(*chosen, executor, options.earlier)
             if not worked:
                 print(f"everything up to {options.until} is there in {options.out}: nothing to do")
         elif options.command == "evaluate":

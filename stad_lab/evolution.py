@@ -28,8 +28,8 @@ from stad_lab.agent import (
     read_world_model,
     save_controller,
 )
-from stad_lab.checkpoints import load_json, locked, save_json
-from stad_lab.controller import initial_parameters, seen_parameters
+from stad_lab.checkpoints import load_json, load_tensors, locked, save_json
+from stad_lab.controller import check_parameters, initial_parameters, parameter_count, seen_parameters
 from stad_lab.mdn_rnn import check_partner
 from stad_lab.parallel import return_freed_memory, run_tasks, work_alone, worker_processes
 from stad_lab.rollouts import track_seeds
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     import cma
 
 LOG = "evolution.json"
+START = "start.safetensors"
 CONTROLLER = "controller.safetensors"
 
 
@@ -107,7 +108,7 @@ def resume(
     variant: str, settings: Settings, folder: Path, log: dict, world_model: WorldModel, kept: int | None
 ) -> tuple["cma.CMAEvolutionStrategy", list[np.ndarray]]:
     """The strategy and its means as the log left them; makes `controller.safetensors` again if it is not the best."""
-    strategy, means = replay(start_of_search(settings, world_model), settings, log["generations"])
+    strategy, means = replay(start_of_search(settings, world_model, folder), settings, log["generations"])
     if log["best"] and log["best"]["generation"] != kept:
         best = averaged_mean(means[: log["best"]["generation"]], settings)
         seen = seen_parameters(settings.features, *sizes(world_model))
@@ -120,11 +121,25 @@ def sizes(world_model: WorldModel) -> tuple[int, int]:
     return world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
 
 
-def start_of_search(settings: Settings, world_model: WorldModel) -> np.ndarray:
-    """CMA-ES's first mean: of all of C's parameters those that act on what it sees."""
-    return initial_parameters(*sizes(world_model), settings.initial_gas)[
-        seen_parameters(settings.features, *sizes(world_model))
-    ]
+def start_of_search(settings: Settings, world_model: WorldModel, folder: Path) -> np.ndarray:
+    """CMA-ES's first mean: those of C's parameters that act on what it sees; in a second round of the C from before.
+
+    Raises:
+        ValueError, FileNotFoundError: the file of that C is damaged, missing, or for another V and M.
+    """
+    whole = initial_parameters(*sizes(world_model), settings.initial_gas)
+    if settings.agent_episodes:
+        whole = load_start(folder / START, world_model)
+    return whole[seen_parameters(settings.features, *sizes(world_model))]
+
+
+def load_start(path: Path, world_model: WorldModel) -> np.ndarray:
+    """The C that a second round starts from, float64 (parameters,). Raises as `start_of_search`."""
+    tensors, facts = load_tensors(path, "delete it and run the same command again, which makes it again")
+    check_partner(path, facts, **world_model.identities)
+    parameters = tensors["parameters"].numpy()
+    check_parameters(parameters, parameter_count(*sizes(world_model)), path)
+    return parameters
 
 
 def expand(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
@@ -304,12 +319,17 @@ def drive_group(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What a worker process does: load V and M once, drive a group of cars in step."""
     work_alone()
-    world_model = source if isinstance(source, WorldModel) else load_world_model(source, variant)
-    autoencoder, mdn_rnn, stride, crop_bar, _ = world_model
-    agent = Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
+    agent = make_agent(source, variant, parameters)
     rules = {"max_frames": limits.max_frames, "patience": limits.patience} if limits else {}
     return_freed_memory()
     return drive(agent, tracks, fast, **rules)
+
+
+def make_agent(source: Path | WorldModel, variant: str, parameters: np.ndarray) -> Agent:
+    """An agent of the V and M that `hand_out` tells of, and of C."""
+    world_model = source if isinstance(source, WorldModel) else load_world_model(source, variant)
+    autoencoder, mdn_rnn, stride, crop_bar, _ = world_model
+    return Agent(autoencoder, mdn_rnn, parameters, stride, crop_bar)
 
 
 def fitness_curves(generations: list[dict]) -> np.ndarray:

@@ -7,6 +7,7 @@ The folder of a run::
     mdn_rnn.safetensors           M
     evolution.json                every generation of CMA-ES
     controller.safetensors        C: the CMA mean that drove the validation tracks best
+    start.safetensors             only in a second round: the earlier run's C, for the new V and M
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
                                   stage, and the most memory that a process has held by its end (in MB, for each start)
 """
@@ -30,13 +31,15 @@ from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory
 from stad_lab.rollouts import collect_rollouts
+from stad_lab.second_round import carry_over, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import training_device
 
 STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
-WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", "controller.safetensors")
+WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", "start.safetensors", "controller.safetensors")
+EARLIER = "give the folder of a first run, as `python -m stad_lab train --out` makes it"
 
 
 def train(
@@ -46,6 +49,7 @@ def train(
     rollouts_folder: str | Path | None = None,
     until: str = "controller",
     executor: Executor | None = None,
+    earlier: str | Path | None = None,
 ) -> bool:
     """Run every stage up to `until` that is not finished in `folder`; run it again after an interrupt to go on.
 
@@ -55,6 +59,8 @@ def train(
         rollouts_folder: where the rollouts are, or go; None for `folder/rollouts`. Runs may share one.
         until: the last stage to run.
         executor: who drives; None for `settings.processes` processes of this machine.
+        earlier: folder of the run whose agent drives `settings.agent_episodes` for the rollouts, and whose C is carried
+            over (see `second_round`); None in a first round.
 
     Returns:
         False if everything was finished already and nothing was done.
@@ -68,6 +74,11 @@ def train(
     check_variant(variant)
     if until not in STAGES:
         raise ValueError(f"unknown stage {until!r}: choose one of {', '.join(STAGES)}")
+    if (settings.agent_episodes > 0) != (earlier is not None):
+        raise ValueError(
+            f"agent_episodes={settings.agent_episodes} and earlier={earlier}: a second round needs both, the number of"
+            " episodes and the folder of the run whose agent drives them; a first round has neither"
+        )
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
     stages = {
@@ -76,8 +87,12 @@ def train(
         "mdn_rnn": lambda: train_mdn_rnn(variant, settings, rollouts_folder, folder),
         "controller": lambda: evolve(variant, settings, folder, executor),
     }
+    if earlier is not None:
+        again = (variant, settings, Path(earlier), rollouts_folder)
+        stages["rollouts"] = lambda: collect_again(*again, executor)
+        stages["controller"] = lambda: carry_over(*again, folder) | evolve(variant, settings, folder, executor)
     with locked(folder):
-        record = open_record(folder, variant, settings)
+        record = open_record(folder, variant, settings, earlier)
         return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder)
 
 
@@ -101,13 +116,13 @@ def run_stages(
         print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
         worked |= did
     if worked or "budget" not in record:
-        record["budget"] = budget(folder, rollouts_folder)
+        record["budget"] = budget(Settings.from_dict(record["settings"]), folder, rollouts_folder)
         save_json(folder / "record.json", record)
     return worked
 
 
-def open_record(folder: Path, variant: str, settings: Settings) -> dict:
-    """The record of the run in `folder`, or a new one.
+def open_record(folder: Path, variant: str, settings: Settings, earlier: str | Path | None = None) -> dict:
+    """The record of the run in `folder`, or a new one; a second round's holds that of the earlier run.
 
     Raises:
         ValueError: the folder holds a run of another variant or of other settings.
@@ -120,6 +135,8 @@ def open_record(folder: Path, variant: str, settings: Settings) -> dict:
             "made_with": provenance(command_of(variant, settings)),
             "seconds": {},
         }
+        if earlier is not None:
+            record["earlier"] = load_json(Path(earlier) / "record.json", EARLIER)
         save_json(path, record)
         return record
     record = load_json(path)
@@ -133,6 +150,7 @@ def command_of(variant: str, settings: Settings) -> str:
     """The command line that makes a run of these settings again."""
     preset = Settings.preset(settings.name).as_dict()
     changes = [f"--set {name}={value}" for name, value in settings.as_dict().items() if value != preset[name]]
+    changes += ["--earlier ..."] if settings.agent_episodes else []
     return " ".join([f"python -m stad_lab train --variant {variant} --settings {settings.name} --out ...", *changes])
 
 
@@ -171,10 +189,18 @@ def git(*arguments: str) -> str | None:
         return None
 
 
-def budget(folder: Path, rollouts_folder: Path) -> dict:
-    """Every logged episode and frame that was driven for this run, by what it was driven for."""
-    blocks = load_json(rollouts_folder / "manifest.json")["blocks"]
-    spent = {"random": {"episodes": len(blocks), "frames": sum(block["frames"] for block in blocks)}}
+def budget(settings: Settings, folder: Path, rollouts_folder: Path) -> dict:
+    """Every logged episode and frame that was driven for this run, by what it was driven for.
+
+    What an earlier run has cost is in that run's record, which lies in this one's: `total_budget` adds it.
+    """
+    spent = {"random": {"episodes": 0, "frames": 0}}
+    numbers = order_of_episodes(settings) if settings.agent_episodes else range(settings.episodes)
+    for block in load_json(rollouts_folder / "manifest.json")["blocks"]:
+        driver = "random" if numbers[block["index"]] < settings.episodes else "agent_driver"
+        one = spent.setdefault(driver, {"episodes": 0, "frames": 0})
+        one["episodes"] += 1
+        one["frames"] += block["frames"]
     if (folder / LOG).exists():
         log = load_json(folder / LOG)["generations"]
         validations = [entry["validation"] for entry in log if "validation" in entry]
@@ -188,6 +214,18 @@ def budget(folder: Path, rollouts_folder: Path) -> dict:
             "frames": sum(validation["frames"] for validation in validations),
         }
     return spent
+
+
+def total_budget(record: dict) -> dict:
+    """Agents, episodes and frames that a run has cost, with those of the earlier runs that it was built on.
+
+    The random driver's episodes of a second round are driven again, and counted again.
+    """
+    parts = [part for part in record["budget"].values() if isinstance(part, dict)]
+    total = {unit: sum(part[unit] for part in parts) for unit in ("episodes", "frames")}
+    total["agents"] = record["budget"].get("agents", 0)
+    before = total_budget(record["earlier"]) if "earlier" in record else dict.fromkeys(total, 0)
+    return {unit: count + before[unit] for unit, count in total.items()}
 
 
 def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:

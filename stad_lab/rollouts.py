@@ -9,7 +9,7 @@ and not kept: a dataset may be larger than the memory (at `paper` settings it ha
 import io
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -35,6 +35,7 @@ TRACK_RANGES = {
 NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array's shape is short
 FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
 COLLECT_FIELDS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
+AGENT_FIELDS = ("agent_episodes", "max_frames", "patience", "stride")  # and if an agent drives for it, too
 
 
 def track_seeds(use: str, count: int, *seed: int) -> list[int]:
@@ -138,24 +139,41 @@ def collect_rollouts(settings: Settings, folder: Path, executor: Executor | None
         OSError: the disk has not enough room for them, or another process works in the folder.
         TaskError: an episode failed.
     """
+    made_with = {field: getattr(settings, field) for field in COLLECT_FIELDS}
+    tasks = [(settings, index) for index in range(settings.episodes)]
+    with worker_processes(settings.processes, executor) as executor:
+        return collect(folder, made_with, drive_randomly, tasks, settings.episode_frames, executor)
+
+
+def collect(
+    folder: Path, made_with: dict, drive_episode: Callable, tasks: list[tuple], frames: int, executor: Executor
+) -> bool:
+    """Drive the episodes that are not in `folder` yet, one for each task, and write their blocks.
+
+    Args:
+        made_with: what the dataset depends on; it is kept in the manifest, and a folder of another one is refused.
+        drive_episode: called with a task, it returns frames, actions and track as `drive_randomly`.
+        frames: of an episode, at most.
+
+    Returns, and raises, as `collect_rollouts`.
+    """
     folder = Path(folder)
-    wanted = {field: getattr(settings, field) for field in COLLECT_FIELDS}
     manifest_path = folder / "manifest.json"
-    manifest = load_json(manifest_path) if manifest_path.exists() else {"settings": wanted, "blocks": []}
-    if manifest["settings"] != wanted:
+    manifest = load_json(manifest_path) if manifest_path.exists() else {"settings": made_with, "blocks": []}
+    if manifest["settings"] != made_with:
         raise ValueError(
-            f"{folder} holds rollouts collected with {manifest['settings']}, and now {wanted} is asked for:"
+            f"{folder} holds rollouts collected with {manifest['settings']}, and now {made_with} is asked for:"
             " choose another folder or the same settings"
         )
     done = {entry["index"] for entry in manifest["blocks"]}
-    missing = [index for index in range(settings.episodes) if index not in done]
+    missing = [index for index in range(len(tasks)) if index not in done]
     if not missing:
         return False
-    with locked(folder), worker_processes(settings.processes, executor) as executor:
-        check_disk(folder, len(missing) * settings.episode_frames * FRAME_BYTES)
+    with locked(folder):
+        check_disk(folder, len(missing) * frames * FRAME_BYTES)
         save_json(manifest_path, manifest)
-        episodes = run_tasks(executor, drive_randomly, [(settings, index) for index in missing])
-        for number, episode in tqdm(episodes, "collect", settings.episodes, initial=len(done), unit="episode"):
+        episodes = run_tasks(executor, drive_episode, [tasks[index] for index in missing])
+        for number, episode in tqdm(episodes, "collect", len(tasks), initial=len(done), unit="episode"):
             entry = save_block(folder, missing[number], *episode)
             manifest["blocks"] = sorted([*manifest["blocks"], entry], key=lambda entry: entry["index"])
             save_json(manifest_path, manifest)
@@ -212,7 +230,8 @@ class Rollouts:
         self.folder = Path(folder)
         remedy = f"collect the rollouts first: python -m stad_lab train ... --rollouts {self.folder}"
         self.manifest = load_json(self.folder / "manifest.json", remedy)
-        found, wanted = len(self.manifest["blocks"]), self.manifest["settings"]["episodes"]
+        made_with = self.manifest["settings"]
+        found, wanted = len(self.manifest["blocks"]), made_with["episodes"] + made_with.get("agent_episodes", 0)
         if found != wanted:
             raise ValueError(f"{self.folder} holds {found} of {wanted} episodes: {remedy}")
         blocks = self.manifest["blocks"]

@@ -40,6 +40,8 @@ class Settings:
     """Frames of an episode, at most. A random driver is soon off the road: short episodes see more of it."""
     random_starts: float = 0.9
     """Share of the episodes that start moving, on a random tile, instead of at rest on tile 0."""
+    agent_episodes: int = 0
+    """Episodes that the agent of an earlier run drives for the dataset, in a second round; 0 in a first one."""
 
     # V, the auto encoder
     latent_size: int = 32
@@ -146,7 +148,7 @@ class Settings:
         return Settings(**known_fields(values))
 
 
-NO_LESS_THAN_ZERO = ("seed", "patience", "kl_weight", "free_bits", "difference_weight", "m_steps")
+NO_LESS_THAN_ZERO = ("seed", "patience", "kl_weight", "free_bits", "difference_weight", "m_steps", "agent_episodes")
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
 SHARES = ("random_starts", "averaged_share")
 FEATURES = ("z, h", "z", "h")

@@ -128,7 +128,7 @@ def verify_log(folder: Path, variant: str, settings: Settings) -> str:
     world_model = read_world_model(folder, variant)
     log = read_log(variant, settings, folder, world_model)
     try:
-        replay(start_of_search(settings, world_model), settings, log["generations"])
+        replay(start_of_search(settings, world_model, folder), settings, log["generations"])
     except ValueError as error:
         raise NotRepeated(error) from error
     return f"ok: {len(log['generations'])} generations lead to the same mean"

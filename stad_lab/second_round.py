@@ -1,0 +1,160 @@
+"""A second round: the first agent drives, V and M learn from what it sees, and what C knows goes over to them.
+
+The random driver is soon on the grass. So the first V and M have hardly seen the road at speed, which is nearly all
+that their agent sees later. In a second round that agent drives for the data, beside the random driver, and V and M
+are trained anew on both. A new V has other latents, and the old C is lost on them. But its outputs on the recorded
+drives are known, so a ridge regression finds the C that gives the same outputs from the new z and h, and evolution goes
+on from there. That costs no episode. (World Models, section 5, proposes to iterate like this; it starts C again.)
+"""
+
+from concurrent.futures import Executor
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from stad_lab.agent import Agent, WorldModel, load_controller, read_world_model
+from stad_lab.car_racing import make_env
+from stad_lab.checkpoints import checksum, save_tensors
+from stad_lab.controller import ACTION_SIZE
+from stad_lab.evolution import CONTROLLER, START, hand_out, load_start, make_agent
+from stad_lab.frames import to_frame
+from stad_lab.mdn_rnn import encode_frames
+from stad_lab.parallel import work_alone, worker_processes
+from stad_lab.rollouts import AGENT_FIELDS, COLLECT_FIELDS, Rollouts, collect, drive_randomly, track_seeds
+from stad_lab.settings import Settings
+
+NOISE = 0.1  # of a frame's steering and gas; it wanders like the random driver's hand, so that many moments differ
+LIMIT = 2.5  # of C's outputs before squashing, as targets: tanh(2.5) = 0.987, and what lies beyond makes no difference
+PENALTY = 0.1  # of the ridge regression, for each frame
+
+
+def collect_again(
+    variant: str, settings: Settings, earlier: Path, folder: Path, executor: Executor | None = None
+) -> bool:
+    """Collect a dataset of both drivers into `folder`; goes on where an earlier call stopped.
+
+    The random driver's episodes are those of a first round with the same settings; the agent's are mixed among them.
+
+    Args:
+        earlier: folder of the first run, of the same variant, whose agent drives.
+        executor: who drives; None for `settings.processes` processes of this machine.
+
+    Returns:
+        False if everything was there already, True if something was collected.
+
+    Raises:
+        ValueError: the folder holds other rollouts, or the first run is damaged.
+        FileNotFoundError: the first run has no agent.
+        OSError, TaskError: as `collect_rollouts`.
+    """
+    parameters, _ = load_controller(earlier / CONTROLLER, variant)
+    made_with = {field: getattr(settings, field) for field in (*COLLECT_FIELDS, *AGENT_FIELDS)}
+    made_with |= {"variant": variant, "controller_sha256": checksum((earlier / CONTROLLER).read_bytes())}
+    longest = max(settings.episode_frames, settings.max_frames)
+    with worker_processes(settings.processes, executor) as executor:
+        source = hand_out(executor, earlier, variant)
+        tasks = [(source, variant, parameters, settings, number) for number in order_of_episodes(settings)]
+        return collect(folder, made_with, drive_either, tasks, longest, executor)
+
+
+def order_of_episodes(settings: Settings) -> list[int]:
+    """The number of every block's episode, int: 0, 1, ... are the random driver's, those after them the agent's.
+
+    They are mixed, because the last blocks of a dataset are held out from training.
+    """
+    rng = np.random.default_rng([settings.seed, 4])
+    return rng.permutation(settings.episodes + settings.agent_episodes).tolist()
+
+
+def drive_either(
+    source: Path | WorldModel, variant: str, parameters: np.ndarray, settings: Settings, number: int
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Drive episode `number` of a second round, as `drive_randomly` does. Runs in a worker process."""
+    if number < settings.episodes:
+        return drive_randomly(settings, number)
+    work_alone()
+    return drive_noisily(make_agent(source, variant, parameters), settings, number - settings.episodes)
+
+
+@torch.inference_mode()
+def drive_noisily(agent: Agent, settings: Settings, index: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Let an agent drive with an unsteady hand: (frames uint8 (T, 64, 64, 3), actions float32 (T, 3), track seed).
+
+    How unsteady it is differs from episode to episode. M remembers what was done, not what was meant.
+    """
+    rng = np.random.default_rng([settings.seed, 5, index])
+    track = track_seeds("collect", settings.agent_episodes, settings.seed, 1)[index]
+    unsteadiness, noise, waiting, frames, actions = rng.uniform(0, 2 * NOISE), np.zeros(2), 0, [], []
+    env = make_env(fast=True, bar=not settings.crop_bar)
+    observation, _ = env.reset(seed=track)
+    agent.reset()
+    while len(frames) < settings.max_frames and not (settings.patience and waiting >= settings.patience):
+        before, action = agent.state, agent.act(observation)
+        noise = 0.9 * noise + unsteadiness * rng.standard_normal(2)
+        action[:2] = np.clip(action[:2] + noise, [-1, 0], 1)
+        _, agent.state = agent.mdn_rnn.remember(
+            torch.from_numpy(agent.latents)[:, None], torch.from_numpy(action)[None, None], before
+        )
+        frames.append(to_frame(observation, settings.crop_bar))
+        actions.append(action)
+        observation, reward, terminated, truncated, _ = env.step(action)
+        waiting = 0 if reward > 0 else waiting + 1
+        if terminated or truncated:
+            break
+    env.close()
+    return np.array(frames), np.array(actions), track
+
+
+def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder: Path, folder: Path) -> bool:
+    """Find the C that does with the new V and M, in `folder`, what the earlier C does; writes `start.safetensors`.
+
+    Returns:
+        False if it was there already.
+
+    Raises:
+        ValueError, FileNotFoundError: a file of one of the runs, or the rollouts, are damaged or missing.
+    """
+    path, new = Path(folder) / START, read_world_model(Path(folder), variant)
+    if path.exists():
+        load_start(path, new)
+        return False
+    rollouts, old = Rollouts(rollouts_folder), read_world_model(earlier, variant)
+    parameters, _ = load_controller(earlier / CONTROLLER, variant)
+    wanted, seen = [], []
+    for block, number in enumerate(order_of_episodes(settings)):
+        if number >= settings.episodes:
+            frames, actions = rollouts.frames[block], rollouts.actions[block]
+            wanted.append(outputs(parameters, features(old, frames, actions)))
+            seen.append(features(new, frames, actions))
+    start = fit_controller(np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT))
+    save_tensors(path, {"parameters": torch.from_numpy(start)}, part="start", variant=variant, **new.identities)
+    return True
+
+
+@torch.inference_mode()
+def features(world_model: WorldModel, frames: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """What C sees in an episode: z and the h before it, float32 (T, latent_size + hidden_size)."""
+    latents = encode_frames(world_model.autoencoder, frames, world_model.stride)[0]
+    hidden, _ = world_model.mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)
+    before = np.concatenate([np.zeros_like(hidden[0, :1]), hidden[0, :-1].numpy()])
+    return np.concatenate([latents, before], axis=1)
+
+
+def outputs(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """C's three outputs before squashing, (T, 3), for what it sees, (T, features)."""
+    weights, bias = parameters[:-ACTION_SIZE].reshape(ACTION_SIZE, -1), parameters[-ACTION_SIZE:]
+    return seen @ weights.T + bias
+
+
+def fit_controller(seen: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """The C that comes nearest to the wanted outputs (T, 3) from what it sees (T, features): float64 (parameters,).
+
+    Ridge regression: minimise |W s + b - y|^2 + penalty |W|^2. Small weights matter more here than the last percent of
+    the fit, since evolution changes all weights by equal steps.
+    """
+    middle, target = seen.mean(axis=0, dtype=np.float64), wanted.mean(axis=0)
+    centred = seen - middle
+    square = centred.T @ centred + PENALTY * len(seen) * np.eye(seen.shape[1])
+    weights = np.linalg.solve(square, centred.T @ (wanted - target)).T
+    return np.concatenate([weights.ravel(), target - weights @ middle])

@@ -1,0 +1,116 @@
+"""A second round: both drivers' episodes, C carried over to another V and M, and one budget for all of it."""
+
+import shutil
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file
+
+from stad_lab.agent import load_controller, read_world_model
+from stad_lab.checkpoints import load_json, save_json
+from stad_lab.evolution import load_start
+from stad_lab.pipeline import total_budget, train
+from stad_lab.rollouts import Rollouts, drive_randomly
+from stad_lab.second_round import collect_again, drive_noisily, features, fit_controller, order_of_episodes, outputs
+from stad_lab.settings import Settings
+from stad_lab.verify import verify
+
+VARIANT = "input_output"
+SETTINGS = Settings.preset("quick", agent_episodes=3, processes=1)
+
+
+@pytest.fixture(scope="module")
+def second(quick_run, tmp_path_factory):
+    """The folder of a second round after the quick run."""
+    folder = tmp_path_factory.mktemp("second") / "run"
+    assert train(VARIANT, SETTINGS, folder, earlier=quick_run)
+    return folder
+
+
+def test_the_dataset_holds_the_episodes_of_both_drivers(second, quick_run, agent):
+    order, rollouts = order_of_episodes(SETTINGS), Rollouts(second / "rollouts")
+    assert sorted(order) == list(range(11)) and len(rollouts.frames) == 11
+    for block, number in enumerate(order):
+        if number < SETTINGS.episodes:
+            assert np.array_equal(rollouts.frames[block], drive_randomly(SETTINGS, number)[0])
+        else:
+            frames, actions, track = drive_noisily(agent, SETTINGS, number - SETTINGS.episodes)
+            assert np.array_equal(rollouts.frames[block], frames)
+            assert np.array_equal(rollouts.actions[block], actions)
+            assert rollouts.manifest["blocks"][block]["track"] == track
+    assert order[-1] != 10  # mixed
+
+
+def test_a_collection_of_both_drivers_goes_on_where_it_stopped(second, quick_run, tmp_path):
+    folder = shutil.copytree(second / "rollouts", tmp_path / "rollouts")
+    manifest = load_json(folder / "manifest.json")
+    save_json(folder / "manifest.json", manifest | {"blocks": manifest["blocks"][2:7]})
+    assert collect_again(VARIANT, SETTINGS, quick_run, folder)
+    assert not collect_again(VARIANT, SETTINGS, quick_run, folder)
+    assert load_json(folder / "manifest.json") == manifest
+
+
+def test_noise_is_in_what_the_agent_does_and_in_what_m_remembers(agent):
+    _, actions, _ = drive_noisily(agent, SETTINGS, 0)
+    remembered = agent.state[0].clone()
+    _, again, _ = drive_noisily(agent, SETTINGS, 0)
+    _, other, _ = drive_noisily(agent, SETTINGS, 1)
+    assert np.array_equal(actions, again) and remembered.equal(agent.state[0])
+    assert not np.array_equal(actions, other)
+    assert (actions >= [-1, 0, 0]).all() and (actions <= 1).all()
+    assert np.abs(np.diff(actions[:, 0])).mean() > 0.001
+
+
+def test_evolution_starts_from_what_the_earlier_agent_knew(second, quick_run):
+    old, new = (read_world_model(folder, VARIANT) for folder in (quick_run, second))
+    start = load_start(second / "start.safetensors", new)
+    parameters, _ = load_controller(quick_run / "controller.safetensors", VARIANT)
+    rollouts, agreed, spread = Rollouts(second / "rollouts"), [], []
+    for block, number in enumerate(order_of_episodes(SETTINGS)):
+        if number >= SETTINGS.episodes:
+            drive = rollouts.frames[block], rollouts.actions[block]
+            wanted, found = outputs(parameters, features(old, *drive)), outputs(start, features(new, *drive))
+            agreed.append(((wanted - found) ** 2).sum(axis=0))
+            spread.append(((wanted - wanted.mean(axis=0)) ** 2).sum(axis=0))
+    assert (np.sum(agreed, axis=0) < np.sum(spread, axis=0)).all()
+    assert not np.array_equal(start, parameters)
+
+
+def test_a_controller_is_found_again_from_its_own_outputs():
+    rng = np.random.default_rng(0)
+    parameters, seen = rng.standard_normal(3 * 20 + 3), 30 * rng.standard_normal((500, 20))
+    assert fit_controller(seen, outputs(parameters, seen)) == pytest.approx(parameters, abs=1e-2)
+
+
+def test_both_rounds_are_in_the_budget(second, quick_run):
+    record, first = load_json(second / "record.json"), load_json(quick_run / "record.json")
+    assert record["earlier"]["budget"] == first["budget"]
+    assert record["budget"]["random"]["episodes"] == 8 and record["budget"]["agent_driver"]["episodes"] == 3
+    mine, before, both = record["budget"], total_budget(first), total_budget(record)
+    frames = sum(mine[part]["frames"] for part in ("random", "agent_driver", "evolution", "validation"))
+    assert both["frames"] == frames + before["frames"]
+    assert both["agents"] == 2 * before["agents"] == 32
+    assert both["episodes"] == before["episodes"] + 8 + 3 + 16 + 4
+
+
+def test_a_finished_second_round_is_verified_and_left_alone(second, quick_run):
+    assert not train(VARIANT, SETTINGS, second, earlier=quick_run)
+    assert not any(outcome.startswith("FAILED") for outcome in verify(second).values())
+
+
+def test_an_evolution_without_its_start_is_refused_and_the_command_makes_it_again(second, quick_run, tmp_path):
+    folder = shutil.copytree(second, tmp_path / "run")
+    before = load_file(folder / "start.safetensors")
+    (folder / "start.safetensors").write_bytes(b"cut")
+    with pytest.raises(ValueError, match=r"start.safetensors is damaged.*delete it and run the same command again"):
+        train(VARIANT, SETTINGS, folder, earlier=quick_run)
+    (folder / "start.safetensors").unlink()
+    train(VARIANT, SETTINGS, folder, earlier=quick_run)
+    assert np.array_equal(load_file(folder / "start.safetensors")["parameters"], before["parameters"])
+
+
+@pytest.mark.parametrize(("episodes", "earlier"), [(3, None), (0, "somewhere")])
+def test_a_second_round_needs_both_an_earlier_run_and_episodes(episodes, earlier, tmp_path):
+    with pytest.raises(ValueError, match=f"agent_episodes={episodes} and earlier={earlier}: a second round needs both"):
+        train(VARIANT, Settings.preset("quick", agent_episodes=episodes), tmp_path / "run", earlier=earlier)
+    assert not (tmp_path / "run").exists()
