@@ -216,7 +216,7 @@ def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStr
     """pycma's strategy with a random source of its own, so that nothing else can disturb it."""
     import cma  # here, because it takes two seconds, and the workers that drive have no use for it
 
-    rng = np.random.default_rng([settings.seed, 3])
+    rng = np.random.default_rng([settings.seed, 3, settings.evolution_seed])
     options = {
         "popsize": settings.population,
         "randn": lambda *shape: rng.standard_normal(shape),
@@ -267,7 +267,7 @@ def drive_generation(
     executor: Executor, source: Any, variant: str, settings: Settings, generation: int, population: np.ndarray
 ) -> dict:
     """Let every agent drive the generation's tracks; returns the log's entry with "returns" [agent][track]."""
-    tracks = track_seeds("evolve", settings.tracks, settings.seed, generation)
+    tracks = track_seeds("evolve", settings.tracks, settings.seed, generation, settings.evolution_seed)
     agents = np.repeat(population, len(tracks), axis=0)
     returns, lengths = drive_parallel(executor, source, variant, agents, tracks * len(population), settings)
     shape = (len(population), len(tracks))

@@ -23,7 +23,7 @@ class Settings:
     name: str = "laptop"
     """Name of the preset these settings began as."""
     seed: int = 0
-    """Seed of the whole run. Data, weights, mutations and all tracks but those for validation follow from it."""
+    """Seed of the whole run: data and weights follow from it, and with `evolution_seed` the search for C."""
     processes: int = 2
     """Worker processes that drive cars. The results do not depend on it."""
 
@@ -84,6 +84,8 @@ class Settings:
     """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
     sigma: float = 0.1
     """CMA-ES's first step size."""
+    evolution_seed: int = 0
+    """Seed of the mutations and of the tracks that are evolved on: several searches may share one V and M."""
     features: str = "z, h"
     """What C sees: "z, h", or "z" or "h" alone, to find out what each of them is worth."""
     initial_gas: float = -0.5
@@ -148,7 +150,7 @@ class Settings:
         return Settings(**known_fields(values))
 
 
-NO_LESS_THAN_ZERO = ("seed", "patience", "kl_weight", "free_bits", "difference_weight", "m_steps", "agent_episodes")
+NO_LESS_THAN_ZERO = ("seed", "evolution_seed", "patience", "kl_weight", "free_bits", "difference_weight", "m_steps", "agent_episodes")
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
 SHARES = ("random_starts", "averaged_share")
 FEATURES = ("z, h", "z", "h")
