@@ -1,4 +1,4 @@
-"""The command line: python -m stad_lab check | train | evaluate | verify | study | benchmark | film | ship."""
+"""The command line, `python -m stad_lab`: check, train, evaluate, verify, replicate, study, benchmark, film, ship."""
 
 import argparse
 import contextlib
@@ -23,6 +23,7 @@ from stad_lab.checkpoints import check_writable, load_json, save_json, write_byt
 from stad_lab.evaluation import describe, evaluate
 from stad_lab.parallel import TaskError
 from stad_lab.pipeline import STAGES, ship, train
+from stad_lab.replication import ROWS, describe_forecast, describe_row, forecast, keep, replicate
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
 from stad_lab.study import study
@@ -102,6 +103,18 @@ def build_parser() -> argparse.ArgumentParser:
         " can be driven again to the same return. The exit status is 1 if anything is not as it was.",
     )
     command.add_argument("run", type=Path, help="folder of the run")
+
+    command = commands.add_parser(
+        "replicate",
+        help="make a row of the replication's table",
+        description="Make one row of the table: V and M, a search for C for every seed, 100 official tracks for each C"
+        " found. It says first how long it will take; stop it when you like, the same command goes on.",
+    )
+    command.add_argument("--row", required=True, help=f"one of {', '.join(ROWS)}")
+    command.add_argument("--out", required=True, type=Path, help="folder of all rows, for example runs/table")
+    command.add_argument(
+        "--keep", action="store_true", help="only copy the records of the finished seeds to stad_lab/records/table"
+    )
 
     command = commands.add_parser(
         "study",
@@ -207,6 +220,11 @@ def main(arguments: list[str] | None = None) -> int:
             found = verify(options.run)
             print("\n".join(f"{name:<14} {outcome}" for name, outcome in found.items()))
             return int(any(outcome.startswith("FAILED") for outcome in found.values()))
+        elif options.command == "replicate" and options.keep:
+            print("\n".join(f"kept in {folder}" for folder in keep(options.row, options.out)) or "no seed is finished")
+        elif options.command == "replicate":
+            print(describe_forecast(options.row, forecast(options.row)), flush=True)
+            print(describe_row(options.row, replicate(options.row, options.out)))
         elif options.command == "study":
             settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
             file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)
@@ -233,7 +251,11 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        again = "; the same command goes on from the last checkpoint" if options.command in ("train", "study") else ""
+        again = (
+            "; the same command goes on from the last checkpoint"
+            if options.command in ("train", "study", "replicate")
+            else ""
+        )
         print(f"\nstopped{again}", file=sys.stderr)
         return 130
     return 0

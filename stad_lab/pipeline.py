@@ -30,7 +30,7 @@ from stad_lab.checkpoints import load_json, load_tensors, locked, save_json, sav
 from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory
-from stad_lab.rollouts import collect_rollouts
+from stad_lab.rollouts import COLLECT_FIELDS, collect_rollouts
 from stad_lab.second_round import carry_over, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import training_device
@@ -217,15 +217,19 @@ def budget(settings: Settings, folder: Path, rollouts_folder: Path) -> dict:
 
 
 def total_budget(record: dict) -> dict:
-    """Agents, episodes and frames that a run has cost, with those of the earlier runs that it was built on.
+    """Agents, episodes and frames that a run has cost, with those of the earlier run that it was built on.
 
-    The random driver's episodes of a second round are driven again, and counted again.
+    The random driver's episodes of a second round are those of the first, made again instead of kept: they count once.
     """
     parts = [part for part in record["budget"].values() if isinstance(part, dict)]
     total = {unit: sum(part[unit] for part in parts) for unit in ("episodes", "frames")}
     total["agents"] = record["budget"].get("agents", 0)
-    before = total_budget(record["earlier"]) if "earlier" in record else dict.fromkeys(total, 0)
-    return {unit: count + before[unit] for unit, count in total.items()}
+    if "earlier" in record:
+        before = total_budget(record["earlier"])
+        again = all(record["settings"][field] == record["earlier"]["settings"][field] for field in COLLECT_FIELDS)
+        made_again = record["budget"]["random"] if again else {}
+        total = {unit: count + before[unit] - made_again.get(unit, 0) for unit, count in total.items()}
+    return total
 
 
 def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:

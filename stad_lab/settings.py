@@ -150,7 +150,16 @@ class Settings:
         return Settings(**known_fields(values))
 
 
-NO_LESS_THAN_ZERO = ("seed", "evolution_seed", "patience", "kl_weight", "free_bits", "difference_weight", "m_steps", "agent_episodes")
+NO_LESS_THAN_ZERO = (
+    "seed",
+    "evolution_seed",
+    "patience",
+    "kl_weight",
+    "free_bits",
+    "difference_weight",
+    "m_steps",
+    "agent_episodes",
+)
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
 SHARES = ("random_starts", "averaged_share")
 FEATURES = ("z, h", "z", "h")

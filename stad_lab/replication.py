@@ -1,0 +1,264 @@
+"""The replication: every row of the table, made by one command, and what the rows say.
+
+A row is a variant, a recipe and some seeds. `replicate` trains V and M once, searches for C once for each seed, and
+drives every C found on the official tracks. In the folder of a row::
+
+    first/      in a recipe of two rounds: the whole first run
+    world/      rollouts, V and M
+    seed0/ ...  V, M and C of one search, with its log, record.json and evaluation.json
+
+Whatever is there already is not done again. The records that we report lie in `stad_lab/records/table`.
+"""
+
+import dataclasses
+import shutil
+import tempfile
+import time
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder, save_autoencoder
+from stad_lab.benchmark import train_m, train_v
+from stad_lab.car_racing import make_env
+from stad_lab.checkpoints import load_json, save_json
+from stad_lab.controller import initial_parameters
+from stad_lab.evaluation import SOLVED, evaluate
+from stad_lab.evolution import CONTROLLER, LOG, drive_generation
+from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
+from stad_lab.parallel import worker_processes
+from stad_lab.pipeline import total_budget, train
+from stad_lab.rollouts import collect_rollouts
+from stad_lab.settings import Settings
+
+RECORDS = Path(__file__).parent / "records" / "table"
+KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every seed
+TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
+TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
+RESAMPLES = 10_000
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of the table."""
+
+    variant: str
+    about: str
+    """What is special about it, for the reader."""
+    settings: Settings
+    """Of the only round, or of the second."""
+    first: Settings | None = None
+    """Of the first round, in a recipe of two."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Of the searches for C. V and M, and a first round, are made once."""
+    world: str | None = None
+    """Name of the row whose rollouts, V and M it shares; None for its own."""
+
+
+def make_rows() -> dict[str, Row]:
+    """All rows of the table by name."""
+    rows = {}
+    for variant in VARIANTS:
+        rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
+    # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
+    first = Settings.preset("laptop", generations=15)
+    second = Settings.preset("laptop", agent_episodes=110, generations=40)
+    for variant in VARIANTS:
+        rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
+    # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
+    one = Settings.preset("laptop", generations=55)
+    rows["one_round"] = Row("input", "one round", one)
+    for name, (about, changes, shares) in ABLATIONS.items():
+        settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
+        rows[name] = Row("input", about, settings, seeds=(0,), world=world)
+    return rows
+
+
+# Name -> what it is, the change of the "one_round" recipe, and whether V is the same.
+ABLATIONS = {
+    "no_M": ("one round, C sees z alone", {"features": "z"}, True),
+    "no_z": ("one round, C sees h alone", {"features": "h"}, True),
+    "untrained_M": ("one round, M's weights are random", {"m_steps": 0}, True),
+    "one_track": (
+        "one round, one episode for each agent",
+        {"tracks": 1, "generations": 220, "validate_every": 20},
+        True,
+    ),
+    "last_mean": ("one round, the last CMA mean alone", {"averaged_share": 0.0}, True),
+    **{f"stride_{k}": (f"one round, stride {k}", {"stride": k}, False) for k in (1, 2, 8)},
+    **{f"latent_{n}": (f"one round, {n} latents", {"latent_size": n}, False) for n in (16, 64)},
+}
+ROWS = make_rows()
+
+
+def replicate(name: str, folder: str | Path, executor: Executor | None = None) -> dict:
+    """Make one row of the table, or what is missing of it; run it again after an interrupt to go on.
+
+    Args:
+        name: one of ROWS.
+        folder: of all rows; this one goes into `folder/name`.
+        executor: who drives; None for processes of this machine.
+
+    Returns:
+        What `summarise` makes of the row.
+
+    Raises:
+        ValueError: an unknown row, or a folder with something else in it.
+        OSError, TaskError, FloatingPointError: as `train` and `evaluate`.
+    """
+    row, folder = find_row(name), Path(folder)
+    first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
+    for seed in row.seeds:
+        search(row, seed, folder / name / f"seed{seed}", first, world, executor)
+    return summarise([folder / name / f"seed{seed}" for seed in row.seeds])
+
+
+def find_row(name: str) -> Row:
+    """The row of a name. Raises ValueError if there is none."""
+    if name not in ROWS:
+        raise ValueError(f"unknown row {name!r}: choose one of {', '.join(ROWS)}")
+    return ROWS[name]
+
+
+def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path | None, Path]:
+    """Make a row's rollouts, V and M, and before them its first round: the folders of both."""
+    first, world = folder / "first" if row.first else None, folder / "world"
+    if row.first:
+        train(row.variant, row.first, first, executor=executor)
+    train(row.variant, row.settings, world, until="mdn_rnn", executor=executor, earlier=first)
+    return first, world
+
+
+def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, executor: Executor | None) -> None:
+    """Search for C with one seed, drive what was found on the official tracks, and write `evaluation.json`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for part in ("autoencoder", "mdn_rnn") if row.settings.m_steps else ("autoencoder",):
+        if not (folder / f"{part}.safetensors").exists():
+            shutil.copy(world / f"{part}.safetensors", folder)
+    settings = dataclasses.replace(row.settings, evolution_seed=seed)
+    worked = train(row.variant, settings, folder, world / "rollouts", executor=executor, earlier=first)
+    if worked or not (folder / "evaluation.json").exists():
+        save_json(folder / "evaluation.json", evaluate(row.variant, folder, TRACKS, executor=executor))
+
+
+def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
+    """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders."""
+    kept = []
+    for seed in find_row(name).seeds:
+        source = Path(folder) / name / f"seed{seed}"
+        if (source / "evaluation.json").exists():
+            kept.append(target / name / source.name)
+            kept[-1].mkdir(parents=True, exist_ok=True)
+            for file in KEPT:
+                shutil.copyfile(source / file, kept[-1] / file)
+    return kept
+
+
+def summarise(folders: list[Path]) -> dict:
+    """What the table shows of a row, from the folders of its seeds.
+
+    Returns:
+        "mean", "standard_deviation" (over all episodes), "interval" (95%, of the mean, over seeds and tracks), "seeds"
+        (the mean of each), "above_900" (share of episodes), "top_90" (mean of each seed's best 90 episodes), and the
+        budget of one seed: "agents", "episodes", "frames" (means over the seeds), with all that was driven before it.
+    """
+    evaluations = [load_json(folder / "evaluation.json", "evaluate again") for folder in folders]
+    returns = np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
+    budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
+    return {
+        "mean": float(returns.mean()),
+        "standard_deviation": float(returns.std(ddof=1)),
+        "interval": bootstrap(returns),
+        "seeds": returns.mean(axis=1).tolist(),
+        "above_900": float((returns > SOLVED).mean()),
+        "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
+        **{unit: float(np.mean([spent[unit] for spent in budgets])) for unit in ("agents", "episodes", "frames")},
+    }
+
+
+def bootstrap(returns: np.ndarray) -> list[float]:
+    """95% interval of the mean of returns (seeds, tracks), by a bootstrap of seeds and, within each, of tracks.
+
+    All seeds drive the same tracks, but each drives them in its own way, so tracks are drawn anew for every seed
+    (a stratified bootstrap, as Agarwal et al., 2021, propose for few runs). Three seeds are few: it is a rough one.
+    """
+    rng, (seeds, tracks) = np.random.default_rng(0), returns.shape
+    drawn = rng.integers(seeds, size=(RESAMPLES, seeds, 1))
+    means = returns[drawn, rng.integers(tracks, size=(RESAMPLES, seeds, tracks))].mean(axis=(1, 2))
+    return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
+
+
+def forecast(name: str) -> dict[str, float]:
+    """How long a row takes on this machine, in seconds: what it is for -> time. Measures for about half a minute.
+
+    An agent's episode is taken to have as many frames as it may have at most, so the searches may be quicker.
+    """
+    row = find_row(name)
+    with tempfile.TemporaryDirectory() as folder:
+        speed = speeds(row, Path(folder))
+    rounds = [row.first, row.settings] if row.first else [row.settings]
+    looks = [s.generations // s.validate_every * s.validation_tracks for s in rounds]
+    driven = [
+        (s.generations * s.population * s.tracks + look) * s.max_frames for s, look in zip(rounds, looks, strict=True)
+    ]
+    return {
+        "rollouts": sum(s.episodes * s.episode_frames + s.agent_episodes * s.max_frames for s in rounds)
+        / speed["V, M, C"],
+        "V": sum(s.v_steps * s.v_batch for s in rounds) / speed["V"],
+        "M": sum(s.m_steps * s.m_batch * s.m_sequence for s in rounds) / speed["M"],
+        "first search": driven[0] / speed["V, M, C"] if row.first else 0.0,
+        "searches": len(row.seeds) * driven[-1] / speed["V, M, C"],
+        "evaluations": len(row.seeds) * TRACKS * 1000 / speed["official"],
+    }
+
+
+def speeds(row: Row, folder: Path) -> dict[str, float]:
+    """What this machine does in a second: frames driven with V, M and C, images of V, frames of M, official frames."""
+    settings, length = row.settings, 60
+    collect_rollouts(Settings.preset("quick"), folder / "rollouts")
+    mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
+    autoencoder = AutoEncoder(row.variant, settings.latent_size, settings.width)
+    save_autoencoder(folder / "autoencoder.safetensors", autoencoder, settings, [])
+    v_identity = load_autoencoder(folder / "autoencoder.safetensors")[1]["identity"]
+    save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, row.variant, [], v_identity)
+    brief = dataclasses.replace(settings, max_frames=length)
+    start = initial_parameters(settings.latent_size, settings.hidden_size, settings.initial_gas)
+    with worker_processes(settings.processes) as executor:
+        for _ in range(2):  # the first time workers start
+            begin = time.perf_counter()
+            entry = drive_generation(executor, folder, row.variant, brief, 0, np.tile(start, (settings.population, 1)))
+            driven = entry["frames"] / (time.perf_counter() - begin)
+    env = make_env(fast=False)
+    env.reset(seed=0)
+    begin = time.perf_counter()
+    for _ in range(length):
+        env.step(np.array([0.0, 0.1, 0.0], np.float32))
+    official = length / (time.perf_counter() - begin)
+    env.close()
+    return {
+        "V, M, C": driven,
+        "official": settings.processes * official,
+        "V": train_v(False, settings.width, folder / "rollouts", 0, steps=12)[0],
+        "M": train_m(False, 0, steps=6, batch=settings.m_batch // 4),
+    }
+
+
+def describe_forecast(name: str, times: dict[str, float]) -> str:
+    """One line that says how long a row takes."""
+    parts = ", ".join(f"{part} {seconds / 60:.0f} min" for part, seconds in times.items() if seconds)
+    return (
+        f"{name}: at most {sum(times.values()) / 3600:.1f} hours on this machine, if nothing of it is there ({parts})"
+    )
+
+
+def describe_row(name: str, found: dict) -> str:
+    """One line of the table."""
+    low, high = found["interval"]
+    return (
+        f"{name}: {found['mean']:.1f} +- {found['standard_deviation']:.0f} on {TRACKS} official tracks"
+        f" ({len(found['seeds'])} seeds), 95% interval of the mean {low:.0f} to {high:.0f},"
+        f" {100 * found['above_900']:.0f}% above {SOLVED}, best {TOP} {found['top_90']:.1f};"
+        f" a seed cost {found['agents']:.0f} agents, {found['episodes']:.0f} episodes"
+    )

@@ -1,0 +1,124 @@
+"""The table: one command makes a row and goes on with it, and its interval covers the truth."""
+
+import functools
+
+import numpy as np
+import pytest
+
+from stad_lab import replication
+from stad_lab.__main__ import main
+from stad_lab.checkpoints import load_json
+from stad_lab.evaluation import evaluate
+from stad_lab.pipeline import total_budget
+from stad_lab.replication import ROWS, Row, bootstrap, describe_forecast, forecast, keep, replicate, summarise
+from stad_lab.settings import Settings
+
+FIRST = Settings.preset("quick", processes=1)
+SECOND = Settings.preset("quick", agent_episodes=2, processes=1)
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """A row of two rounds and two seeds, and one that shares its world: (the folder of both, their summaries)."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(ROWS, "two", Row("input", "two rounds", SECOND, FIRST, seeds=(0, 1)))
+        patch.setitem(
+            ROWS, "blind", Row("input", "no M", Settings.preset("quick", features="z"), seeds=(3,), world="one")
+        )
+        patch.setitem(ROWS, "one", Row("input", "one round", FIRST, seeds=(0,)))
+        patch.setattr(replication, "TRACKS", 2)
+        patch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
+        folder = tmp_path_factory.mktemp("table")
+        yield folder, {name: replicate(name, folder) for name in ("two", "blind")}
+
+
+def test_a_row_holds_a_search_for_every_seed_on_the_same_world(table):
+    folder, _ = table
+    files = [(folder / "two" / f"seed{seed}" / "autoencoder.safetensors").read_bytes() for seed in (0, 1)]
+    assert files[0] == files[1]
+    logs = [load_json(folder / "two" / f"seed{seed}" / "evolution.json") for seed in (0, 1)]
+    assert logs[0]["autoencoder"] == logs[1]["autoencoder"]
+    assert logs[0]["generations"][0]["tracks"] != logs[1]["generations"][0]["tracks"]
+    assert logs[0]["generations"][0]["mean_checksum"] != logs[1]["generations"][0]["mean_checksum"]
+
+
+def test_a_row_that_shares_a_world_trains_none_of_its_own(table):
+    folder, _ = table
+    assert {path.name for path in (folder / "blind").iterdir()} == {"seed3"}
+    assert (folder / "one" / "world").is_dir() and not (folder / "one" / "seed0").exists()
+
+
+def test_what_is_there_is_not_done_again(table):
+    folder, summaries = table
+    before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+    assert replicate("two", folder) == summaries["two"]
+    assert {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_a_lost_evaluation_is_driven_again_to_the_same_numbers(table):
+    folder, summaries = table
+    (folder / "two" / "seed1" / "evaluation.json").unlink()
+    assert replicate("two", folder) == summaries["two"]
+
+
+def test_the_summary_counts_every_episode_that_was_driven_for_a_seed(table):
+    folder, summaries = table
+    record = load_json(folder / "two" / "seed0" / "record.json")
+    # 8 random ones, 4 generations of 4 agents and 2 looks at 2 tracks; 2 by the agent, and the other two again.
+    assert summaries["two"]["episodes"] == 8 + 16 + 4 + 2 + 16 + 4 == total_budget(record)["episodes"]
+    assert summaries["two"]["agents"] == 32
+    assert len(summaries["two"]["seeds"]) == 2 and summaries["blind"]["episodes"] == 8 + 16 + 4
+
+
+def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
+    folder, summaries = table
+    kept = keep("two", folder, tmp_path)
+    assert [path.name for path in kept] == ["seed0", "seed1"] and summarise(kept) == summaries["two"]
+    assert keep("one", folder, tmp_path) == []
+    sizes = [path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()]
+    assert len(sizes) == 8 and max(sizes) < 200_000  # neither V nor M
+
+
+def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long():
+    times = forecast("paper_input")
+    assert all(times[part] > 0 for part in ("rollouts", "V", "M", "searches", "evaluations"))
+    assert times["first search"] == 0 and times["searches"] > times["evaluations"]
+    line = describe_forecast("paper_input", times)
+    assert line.startswith("paper_input: at most ") and "searches" in line and "first search" not in line
+
+
+def test_every_row_has_the_budget_that_the_table_promises():
+    for name, row in ROWS.items():
+        rounds = [row.first, row.settings] if row.first else [row.settings]
+        agents = sum(settings.generations * settings.population for settings in rounds)
+        looks = sum(settings.generations // settings.validate_every * settings.validation_tracks for settings in rounds)
+        driven = sum(settings.generations * settings.population * settings.tracks for settings in rounds)
+        episodes = row.settings.episodes + row.settings.agent_episodes + driven + looks
+        assert agents <= 4800 and (name.startswith("paper") or episodes <= 4800), (name, agents, episodes)
+    assert {row.variant for name, row in ROWS.items() if name.startswith("two_rounds") and len(row.seeds) >= 3} == {
+        "frame",
+        "input",
+        "output",
+        "input_output",
+    }
+
+
+def test_the_interval_covers_the_truth_more_often_than_one_over_tracks_alone():
+    rng, hits, narrow = np.random.default_rng(1), [], []
+    for _ in range(40):
+        returns = 900 + 15 * rng.standard_normal((5, 1)) + 60 * rng.standard_normal((5, 100))
+        low, high = bootstrap(returns)
+        hits.append(low < 900 < high)
+        spread = 1.96 * returns.std() / np.sqrt(returns.size)
+        narrow.append(abs(returns.mean() - 900) < spread)
+    assert np.mean(hits) > 0.8 > np.mean(narrow)
+
+
+def test_an_unknown_row_ends_in_one_line_that_names_the_rows(capsys, tmp_path):
+    assert main(["replicate", "--row", "papers", "--out", str(tmp_path)]) == 2
+    assert "error: unknown row 'papers': choose one of paper_frame, paper_input" in capsys.readouterr().err
+
+
+def test_the_command_keeps_what_is_finished(tmp_path, capsys):
+    assert main(["replicate", "--row", "one_round", "--out", str(tmp_path), "--keep"]) == 0
+    assert "no seed is finished" in capsys.readouterr().out
