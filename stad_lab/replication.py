@@ -64,7 +64,7 @@ def make_rows() -> dict[str, Row]:
         rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
     # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
     first = Settings.preset("laptop", generations=15)
-    second = Settings.preset("laptop", agent_episodes=110, generations=40)
+    second = Settings.preset("laptop", agent_episodes=110, generations=40, sigma=0.05)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
     # 900 + 55 x 64 + 11 x 16: 4,596 episodes.

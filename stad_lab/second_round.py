@@ -26,7 +26,7 @@ from stad_lab.settings import Settings
 
 NOISE = 0.1  # of a frame's steering and gas; it wanders like the random driver's hand, so that many moments differ
 LIMIT = 2.5  # of C's outputs before squashing, as targets: tanh(2.5) = 0.987, and what lies beyond makes no difference
-PENALTY = 0.1  # of the ridge regression, for each frame
+PENALTY = 0.01  # of the ridge regression, for each frame
 
 
 def collect_again(

@@ -1,6 +1,7 @@
 """The table: one command makes a row and goes on with it, and its interval covers the truth."""
 
 import functools
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -29,7 +30,8 @@ def table(tmp_path_factory):
         patch.setattr(replication, "TRACKS", 2)
         patch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
         folder = tmp_path_factory.mktemp("table")
-        yield folder, {name: replicate(name, folder) for name in ("two", "blind")}
+        with ThreadPoolExecutor(1) as executor:
+            yield folder, {name: replicate(name, folder, executor) for name in ("two", "blind")}
 
 
 def test_a_row_holds_a_search_for_every_seed_on_the_same_world(table):
@@ -80,11 +82,11 @@ def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
 
 
 def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long():
-    times = forecast("paper_input")
+    times = forecast("one_round")
     assert all(times[part] > 0 for part in ("rollouts", "V", "M", "searches", "evaluations"))
     assert times["first search"] == 0 and times["searches"] > times["evaluations"]
-    line = describe_forecast("paper_input", times)
-    assert line.startswith("paper_input: at most ") and "searches" in line and "first search" not in line
+    line = describe_forecast("one_round", times)
+    assert line.startswith("one_round: at most ") and "searches" in line and "first search" not in line
 
 
 def test_every_row_has_the_budget_that_the_table_promises():
