@@ -101,8 +101,7 @@ class Settings:
     validation_tracks: int = 16
     """Tracks of such a look."""
     averaged_share: float = 0.4
-    """Share of the generations so far, the last ones, whose CMA means are averaged into the controller that is kept;
-    0 takes the last mean alone. Every mean is noisy in its own way, and their average is less so."""
+    """Share of the generations, the last ones, whose CMA means are averaged into C; 0 for the last mean alone."""
 
     def __post_init__(self):
         for field in dataclasses.fields(self):

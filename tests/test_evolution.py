@@ -14,8 +14,8 @@ import pytest
 
 from stad_lab.agent import load_controller
 from stad_lab.checkpoints import save_json
-from stad_lab.controller import initial_parameters
-from stad_lab.evolution import evolve, fitness_curves, make_strategy, replay
+from stad_lab.controller import initial_parameters, seen_parameters
+from stad_lab.evolution import averaged_mean, evolve, expand, fitness_curves, make_strategy, replay
 from stad_lab.rollouts import TRACK_RANGES
 from stad_lab.settings import Settings
 
@@ -111,14 +111,31 @@ def test_worst_average_and_best_of_agents_on_several_tracks():
     assert fitness_curves(generations).tolist() == [[0, 7], [17 / 3, 23 / 3], [15, 8]]
 
 
-def test_the_controller_is_the_mean_that_drove_the_validation_tracks_best(one_go):
+def test_the_controller_is_the_averaged_mean_that_drove_the_validation_tracks_best(one_go):
     log = read(one_go)
     looks = {entry["generation"]: entry["validation"]["mean"] for entry in log["generations"] if "validation" in entry}
     assert list(looks) == [2, 4, 6]
     assert log["best"] == {"generation": max(looks, key=looks.get), "validation": max(looks.values())}
     start = initial_parameters(32, 32, settings().initial_gas)
-    best = replay(start, settings(), log["generations"][: log["best"]["generation"]])
-    assert np.array_equal(load_controller(one_go / "controller.safetensors", "input_output")[0], best.mean)
+    _, means = replay(start, settings(), log["generations"][: log["best"]["generation"]])
+    best = averaged_mean(means, settings())
+    assert np.array_equal(load_controller(one_go / "controller.safetensors", "input_output")[0], best)
+
+
+def test_the_last_share_of_the_means_is_averaged_and_one_at_least():
+    means = [np.full(3, float(number)) for number in range(10)]
+    assert averaged_mean(means, settings(averaged_share=0.4))[0] == 7.5
+    assert averaged_mean(means, settings(averaged_share=0.0))[0] == 9
+    assert averaged_mean(means[:1], settings(averaged_share=0.4))[0] == 0
+
+
+@pytest.mark.parametrize(("features", "columns"), [("z", slice(4)), ("h", slice(4, 10))])
+def test_what_c_may_not_see_has_no_weight(features, columns):
+    seen = seen_parameters(features, 4, 6)
+    whole = expand(np.arange(1.0, seen.sum() + 1), seen)
+    weights = whole[:30].reshape(3, 10)
+    assert (weights[:, columns] != 0).all() and (np.delete(weights, columns, axis=1) == 0).all()
+    assert (whole[30:] != 0).all()
 
 
 THREADS = """
@@ -156,11 +173,12 @@ def test_a_replay_restores_the_full_state():
         population = strategy.ask()
         returns = [[-float((agent**2).sum()), -float(((agent - 1) ** 2).sum())] for agent in population]
         strategy.tell(population, [-np.mean(pair) for pair in returns])
-        replayed = replay(start, settings(), log)
+        replayed, _ = replay(start, settings(), log)
         following = replayed.ask()
         assert np.array_equal(following, population)  # the next population, to the last bit
         log.append({"returns": returns, "mean_checksum": zlib.crc32(strategy.mean.tobytes())})
-    replayed = replay(start, settings(), json.loads(json.dumps(log)))
+    replayed, means = replay(start, settings(), json.loads(json.dumps(log)))
+    assert len(means) == 12 and np.array_equal(means[-1], strategy.mean)
     assert strategy.countiter == replayed.countiter == 12
     assert strategy.sigma == replayed.sigma != settings().sigma
     for state in (lambda s: s.mean, lambda s: s.C, lambda s: s.pc, lambda s: s.adapt_sigma.ps):
@@ -174,9 +192,11 @@ def test_a_replay_restores_the_full_state():
 
 
 def test_another_seed_evolves_otherwise():
-    populations = [make_strategy(np.zeros(8), settings(seed=seed)).ask() for seed in (0, 0, 1)]
+    changes = ({}, {"evolution_seed": 0}, {"seed": 1}, {"evolution_seed": 1})
+    populations = [make_strategy(np.zeros(8), settings(**change)).ask() for change in changes]
     assert np.array_equal(populations[0], populations[1])
     assert not np.array_equal(populations[0], populations[2])
+    assert not np.array_equal(populations[0], populations[3])
 
 
 def test_numpy_s_global_random_state_is_untouched_and_untouching():
