@@ -84,24 +84,39 @@ def evolve(
         done = len(log["generations"])
         progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
         for generation in progress:
-            population = np.array(strategy.ask())
-            entry = drive_generation(executor, source, variant, settings, generation, expand(population, seen))
-            strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
-            means.append(strategy.mean.copy())
-            entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
-            controller = expand(averaged_mean(means, settings), seen)
-            if (generation + 1) % settings.validate_every == 0:
-                entry["validation"] = validate(executor, source, variant, settings, controller)
+            entry = run_generation(generation, strategy, means, seen, executor, source, variant, settings)
             log["generations"].append(entry)
             better = note_best(log)
             save_json(folder / LOG, log)
             if better:  # after the log: a controller that the log does not know would be a stranger
-                keep_controller(variant, folder, log, controller, world_model)
+                keep_controller(variant, folder, log, expand(averaged_mean(means, settings), seen), world_model)
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
             if watch:
                 watch(log["generations"])
     return True
+
+
+def run_generation(
+    generation: int,
+    strategy: "cma.CMAEvolutionStrategy",
+    means: list[np.ndarray],
+    seen: np.ndarray,
+    executor: Executor,
+    source: Any,
+    variant: str,
+    settings: Settings,
+) -> dict:
+    """Ask for a population, let it drive, and tell its fitness; adds to the means, returns the log's entry."""
+    population = np.array(strategy.ask())
+    entry = drive_generation(executor, source, variant, settings, generation, expand(population, seen))
+    strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
+    means.append(strategy.mean.copy())
+    entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
+    if (generation + 1) % settings.validate_every == 0:
+        controller = expand(averaged_mean(means, settings), seen)
+        entry["validation"] = validate(executor, source, variant, settings, controller)
+    return entry
 
 
 def resume(
