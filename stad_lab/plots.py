@@ -394,6 +394,56 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
     return figure
 
 
+def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figure:
+    """The paper's three figures, worst, average and best agent against the generation, with seeds as bands.
+
+    Args:
+        runs: name -> (seeds, 3, generations), for each seed what `evolution.fitness_curves` makes. A line is the mean
+            over the seeds, its band goes from the lowest to the highest.
+        window: generations of the running mean, which lets a line be seen through the noise.
+    """
+    figure, axes = new_figure(11.0, 3.9, 1, 3, sharey=True)
+    for panel, (axis, name) in enumerate(zip(axes[0], ("worst", "average", "best"), strict=True)):
+        for (label, curves), color in zip(runs.items(), COLORS, strict=False):
+            smooth = np.apply_along_axis(np.convolve, 1, curves[:, panel], np.full(window, 1 / window), "valid")
+            generation = np.arange(smooth.shape[1]) + (window + 1) / 2
+            axis.plot(generation, smooth.mean(axis=0), color=color, lw=1.6, label=label)
+            axis.fill_between(generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.2, lw=0)
+        axis.axhline(900, color="grey", lw=0.8, ls=":")
+        axis.set_title(f"{name} agent of a generation", fontsize=10)
+        axis.set_xlabel("generation")
+    axes[0, 0].set_ylabel(f"fitness, mean of {window} generations")
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    figure.suptitle(title, fontsize=11)
+    last = ", ".join(f"{name} {curves[:, 1, -window:].mean():.0f}" for name, curves in runs.items())
+    figure.set_label(f"{title}. Average agent of the last {window} generations, mean of the seeds: {last}.")
+    return figure
+
+
+def plot_episodes(
+    runs: dict[str, list[tuple[np.ndarray, np.ndarray]]], published: dict[str, dict[int, float]], title: str
+) -> Figure:
+    """Score against the episodes that were driven for it, on a logarithmic axis: the fair comparison of recipes.
+
+    Args:
+        runs: name -> for every seed its episodes and its scores at those.
+        published: name -> episodes -> score, as others have reported: points without a line.
+    """
+    figure, ((axis,),) = new_figure(8.0, 4.4)
+    for (name, seeds), color in zip(runs.items(), COLORS, strict=False):
+        for number, (episodes, scores) in enumerate(seeds):
+            axis.plot(episodes, scores, color=color, lw=1.3, alpha=0.8, label=name if number == 0 else None)
+    for (name, points), marker in zip(published.items(), MARKERS, strict=False):
+        axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
+    axis.axhline(900, color="grey", lw=0.8, ls=":")
+    axis.set(xscale="log", xlabel="episodes driven in all (logarithmic)", ylabel="score", ylim=(None, 960))
+    axis.legend(frameon=False, fontsize=9)
+    axis.set_title(title, fontsize=11)
+    last = ", ".join(f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}" for name, seeds in runs.items())
+    figure.set_label(f"{title}. At the end, mean of the seeds: {last}.")
+    return figure
+
+
 def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
     """Every episode's return as a dot, one row for each name, with the mean as a bar."""
     figure, ((axis,),) = new_figure(7.0, 0.8 * len(returns) + 1.4)

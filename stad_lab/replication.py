@@ -35,6 +35,8 @@ from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent / "records" / "table"
 KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every seed
+# World Models' own log: score of the best agent of a population of 64, 16 episodes each, against the episodes so far.
+WORLD_MODELS = {25 * 64 * 16: 823.0, 50 * 64 * 16: 867.0, 200 * 64 * 16: 880.0, 1800 * 64 * 16: 900.5}
 TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
 TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
 RESAMPLES = 10_000
@@ -154,6 +156,23 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
             for file in KEPT:
                 shutil.copyfile(source / file, kept[-1] / file)
     return kept
+
+
+def learning_curve(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The scores on the validation tracks of one seed, and how many episodes had been driven for each: two (looks,).
+
+    All episodes count: the random driver's, those of a first round and of its agent, and the validation itself.
+    """
+    log, record = load_json(folder / LOG)["generations"], load_json(folder / "record.json")
+    own = sum(record["budget"][part]["episodes"] for part in ("evolution", "validation"))
+    driven, episodes, scores = total_budget(record)["episodes"] - own, [], []
+    for entry in log:
+        driven += sum(len(returns) for returns in entry["returns"])
+        if "validation" in entry:
+            driven += len(entry["validation"]["returns"])
+            episodes.append(driven)
+            scores.append(entry["validation"]["mean"])
+    return np.array(episodes), np.array(scores)
 
 
 def summarise(folders: list[Path]) -> dict:

@@ -4,7 +4,7 @@ The random driver is soon on the grass. So the first V and M have hardly seen th
 that their agent sees later. In a second round that agent drives for the data, beside the random driver, and V and M
 are trained anew on both. A new V has other latents, and the old C is lost on them. But its outputs on the recorded
 drives are known, so a ridge regression finds the C that gives the same outputs from the new z and h, and evolution goes
-on from there. That costs no episode. (World Models, section 5, proposes to iterate like this; it starts C again.)
+on from there. That costs no episode. (World Models, section 5, proposes such rounds for harder tasks.)
 """
 
 from concurrent.futures import Executor

@@ -10,8 +10,21 @@ from stad_lab import replication
 from stad_lab.__main__ import main
 from stad_lab.checkpoints import load_json
 from stad_lab.evaluation import evaluate
+from stad_lab.evolution import fitness_curves
 from stad_lab.pipeline import total_budget
-from stad_lab.replication import ROWS, Row, bootstrap, describe_forecast, forecast, keep, replicate, summarise
+from stad_lab.plots import plot_episodes, plot_seeds
+from stad_lab.replication import (
+    ROWS,
+    WORLD_MODELS,
+    Row,
+    bootstrap,
+    describe_forecast,
+    forecast,
+    keep,
+    learning_curve,
+    replicate,
+    summarise,
+)
 from stad_lab.settings import Settings
 
 FIRST = Settings.preset("quick", processes=1)
@@ -70,6 +83,28 @@ def test_the_summary_counts_every_episode_that_was_driven_for_a_seed(table):
     assert summaries["two"]["episodes"] == 8 + 16 + 4 + 2 + 16 + 4 == total_budget(record)["episodes"]
     assert summaries["two"]["agents"] == 32
     assert len(summaries["two"]["seeds"]) == 2 and summaries["blind"]["episodes"] == 8 + 16 + 4
+
+
+def test_a_learning_curve_ends_at_all_the_episodes_of_its_seed(table):
+    folder, summaries = table
+    curves = [learning_curve(folder / "two" / f"seed{seed}") for seed in (0, 1)]
+    for episodes, scores in curves:
+        assert episodes.tolist() == [8 + 16 + 4 + 2 + 8 + 2, summaries["two"]["episodes"]] and len(scores) == 2
+    figure = plot_episodes({"two": curves}, {"World Models (v0)": WORLD_MODELS}, "Score")
+    (axis,) = figure.axes
+    assert axis.get_xscale() == "log" and axis.get_xlim()[1] > 1_800_000
+    assert figure.get_label() == f"Score. At the end, mean of the seeds: two {np.mean([c[1][-1] for c in curves]):.0f}."
+
+
+def test_a_band_goes_from_the_lowest_to_the_highest_seed(table):
+    logs = [load_json(table[0] / "two" / f"seed{seed}" / "evolution.json") for seed in (0, 1)]
+    curves = np.stack([fitness_curves(log["generations"]) for log in logs])
+    figure = plot_seeds({"two": curves}, "Evolution", window=2)
+    for panel, axis in enumerate(figure.axes):
+        smooth = (curves[:, panel, 1:] + curves[:, panel, :-1]) / 2
+        band = axis.collections[0].get_paths()[0].vertices[:, 1]
+        assert (band.min(), band.max()) == pytest.approx((smooth.min(), smooth.max()))
+        assert axis.lines[0].get_ydata() == pytest.approx(smooth.mean(axis=0))
 
 
 def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
