@@ -35,7 +35,7 @@ TRACK_RANGES = {
 NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array's shape is short
 FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
 COLLECT_FIELDS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
-AGENT_FIELDS = ("agent_episodes", "max_frames", "patience", "stride")  # and if an agent drives for it, too
+AGENT_FIELDS = ("agent_episodes", "max_frames", "patience")  # and if an agent drives for it, too
 
 
 def track_seeds(use: str, count: int, *seed: int) -> list[int]:
