@@ -27,7 +27,7 @@ import torch
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoencoder
 from stad_lab.checkpoints import load_json, load_tensors, locked, save_json, save_tensors
-from stad_lab.evolution import LOG, evolve
+from stad_lab.evolution import LOG, START, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory
 from stad_lab.rollouts import COLLECT_FIELDS, collect_rollouts
@@ -38,7 +38,7 @@ from stad_lab.training import training_device
 STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
-WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", "start.safetensors", "controller.safetensors")
+WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, "controller.safetensors")
 EARLIER = "give the folder of a first run, as `python -m stad_lab train --out` makes it"
 
 
@@ -235,14 +235,16 @@ def total_budget(record: dict) -> dict:
 def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     """Copy what a run has trained into `stad_lab/pretrained/`: records as they are, V and M in half precision.
 
-    Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run.
+    Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run. A second
+    round goes into a folder `second_round` of its own; returns the new folder.
 
     Raises:
         FileNotFoundError: the run has no V.
         ValueError: the run is damaged, or of another variant.
     """
-    folder, target = Path(folder), target / variant
+    folder = Path(folder)
     load_autoencoder(folder / WEIGHTS[0], variant)
+    target = target / "second_round" / variant if (folder / START).exists() else target / variant
     target.mkdir(parents=True, exist_ok=True)
     for name in WEIGHTS:
         if (folder / name).exists():

@@ -16,12 +16,13 @@ from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.rollouts import TRACK_RANGES, track_seeds
 from stad_lab.settings import Settings
 
-AGENTS = sorted(file.parent.name for file in PRETRAINED.glob("*/controller.safetensors"))
+# An agent is named by its folder: `input`, or `second_round/input`.
+AGENTS = sorted(file.parent.relative_to(PRETRAINED).as_posix() for file in PRETRAINED.rglob("controller.safetensors"))
 README = Path(__file__).parent.parent / "README.md"
 
 
-def read(variant, name):
-    return json.loads((PRETRAINED / variant / name).read_text())
+def read(agent, name):
+    return json.loads((PRETRAINED / agent / name).read_text())
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -45,20 +46,20 @@ def test_the_agent_of_the_variant_input_is_shipped():
     assert "input" in AGENTS
 
 
-@pytest.mark.parametrize("variant", AGENTS)
-def test_a_shipped_evaluation_belongs_to_the_shipped_controller_and_to_unseen_tracks(variant):
-    result = read(variant, "evaluation.json")
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_shipped_evaluation_belongs_to_the_shipped_controller_and_to_unseen_tracks(agent):
+    result = read(agent, "evaluation.json")
     returns = np.array([episode["return"] for episode in result["episodes"]])
-    assert result["controller_sha256"] == checksum((PRETRAINED / variant / "controller.safetensors").read_bytes())
+    assert result["controller_sha256"] == checksum((PRETRAINED / agent / "controller.safetensors").read_bytes())
     assert result["renderer"] == "official" and len(returns) == 100
     assert summarise(returns).items() <= result.items()
     low, high = TRACK_RANGES["test"]
     assert all(low <= episode["track"] < high for episode in result["episodes"])
 
 
-@pytest.mark.parametrize("variant", AGENTS)
-def test_a_shipped_log_holds_every_generation_and_the_best_mean(variant):
-    log, record = read(variant, "evolution.json"), read(variant, "record.json")
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_shipped_log_holds_every_generation_and_the_best_mean(agent):
+    log, record = read(agent, "evolution.json"), read(agent, "record.json")
     settings = Settings.from_dict(record["settings"])
     assert fitness_curves(log["generations"]).shape == (3, settings.generations)
     looks = {entry["generation"]: entry["validation"]["mean"] for entry in log["generations"] if "validation" in entry}
@@ -66,16 +67,16 @@ def test_a_shipped_log_holds_every_generation_and_the_best_mean(variant):
     assert record["budget"]["agents"] == settings.generations * settings.population
 
 
-@pytest.mark.parametrize("variant", AGENTS)
-def test_a_shipped_agent_drives(variant):
-    returns, _ = drive(load_agent(variant), track_seeds("test", 4, 7))
+@pytest.mark.parametrize("agent", AGENTS)
+def test_a_shipped_agent_drives(agent):
+    returns, _ = drive(load_agent(Path(agent).name, PRETRAINED / agent), track_seeds("test", 4, 7))
     assert returns.mean() > 600  # driving straight on, or on grass, earns less than 100
 
 
-@pytest.mark.parametrize("variant", AGENTS)
-def test_the_readme_reports_the_shipped_evaluation(variant):
-    result = read(variant, "evaluation.json")
-    row = re.search(rf"^\| `{variant}` .*$", README.read_text(), re.M).group()
+@pytest.mark.parametrize("agent", AGENTS)
+def test_the_readme_reports_the_shipped_evaluation(agent):
+    result = read(agent, "evaluation.json")
+    row = re.search(rf"^\| `{agent}` .*$", README.read_text(), re.M).group()
     low, high = result["interval"]
     for figure in (f"{result['mean']:.1f}", f"{result['standard_deviation']:.1f}", f"{low:.1f} to {high:.1f}"):
         assert figure in row

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from stad_lab.agent import load_controller, read_world_model
+from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.evolution import load_start
-from stad_lab.pipeline import total_budget, train
+from stad_lab.pipeline import ship, total_budget, train
 from stad_lab.rollouts import Rollouts, drive_randomly
 from stad_lab.second_round import collect_again, drive_noisily, features, fit_controller, order_of_episodes, outputs
 from stad_lab.settings import Settings
@@ -100,6 +100,15 @@ def test_both_rounds_are_in_the_budget(second, quick_run):
 def test_a_finished_second_round_is_verified_and_left_alone(second, quick_run):
     assert not train(VARIANT, SETTINGS, second, earlier=quick_run)
     assert not any(outcome.startswith("FAILED") for outcome in verify(second).values())
+
+
+def test_a_shipped_second_round_lies_beside_the_first_and_can_be_verified(second, quick_run, tmp_path):
+    assert ship(VARIANT, quick_run, tmp_path) == tmp_path / VARIANT
+    shipped = ship(VARIANT, second, tmp_path)
+    assert shipped == tmp_path / "second_round" / VARIANT
+    assert load_agent(VARIANT, shipped).parameters.size == 3 * 64 + 3
+    found = verify(shipped)
+    assert found["log of CMA-ES"] == "ok: 4 generations lead to the same mean" and found["C"].startswith("ok")
 
 
 def test_an_evolution_without_its_start_is_refused_and_the_command_makes_it_again(second, quick_run, tmp_path):
