@@ -150,8 +150,9 @@ def outputs(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
 def fit_controller(seen: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """The C that comes nearest to the wanted outputs (T, 3) from what it sees (T, features): float64 (parameters,).
 
-    Ridge regression: minimise |W s + b - y|^2 + penalty |W|^2. Small weights matter more here than the last percent of
-    the fit, since evolution changes all weights by equal steps.
+    Ridge regression: W and b make the mean squared error of W s + b, plus the penalty times the sum of all squared
+    weights, the smallest. Small weights matter more here than the last percent of the fit, since evolution changes all
+    weights by equal steps.
     """
     middle, target = seen.mean(axis=0, dtype=np.float64), wanted.mean(axis=0)
     centred = seen - middle
