@@ -242,6 +242,7 @@ def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStr
     return cma.CMAEvolutionStrategy(start, settings.sigma, options)
 
 
+@threadpool_limits.wrap(limits=1)
 def replay(
     start: np.ndarray, settings: Settings, generations: list[dict]
 ) -> tuple["cma.CMAEvolutionStrategy", list[np.ndarray]]:

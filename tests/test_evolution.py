@@ -11,11 +11,12 @@ import zlib
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_limits
 
 from stad_lab.agent import load_controller
 from stad_lab.checkpoints import save_json
 from stad_lab.controller import initial_parameters, seen_parameters
-from stad_lab.evolution import averaged_mean, evolve, expand, fitness_curves, make_strategy, replay
+from stad_lab.evolution import averaged_mean, evolve, expand, fitness_curves, make_strategy, mean_checksum, replay
 from stad_lab.rollouts import TRACK_RANGES
 from stad_lab.settings import Settings
 
@@ -164,6 +165,19 @@ def test_the_strategy_of_867_parameters_does_not_depend_on_the_number_of_threads
         for threads in ("1", "2")
     ]
     assert sums[0] == sums[1] != ""
+
+
+def test_a_replay_comes_to_the_logged_means_with_any_number_of_threads():
+    start, log = initial_parameters(32, 256), []
+    with threadpool_limits(1):
+        strategy = make_strategy(start, Settings.preset("laptop"))
+        for _ in range(14):
+            population = np.array(strategy.ask())
+            returns = [[-float((agent**2).sum())] for agent in population]
+            strategy.tell(population, [-np.mean(one) for one in returns])
+            log.append({"returns": returns, "mean_checksum": mean_checksum(strategy.mean)})
+    with threadpool_limits(2):
+        assert np.array_equal(replay(start, Settings.preset("laptop"), log)[1][-1], strategy.mean)
 
 
 def test_a_replay_restores_the_full_state():
