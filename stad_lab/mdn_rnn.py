@@ -237,7 +237,7 @@ def fit_mdn_rnn(
     with locked(path.parent):
         history = fit(mdn_rnn, batch, losses, heldout_losses, steps, rate, checkpoint, "train M", identity)
         save_mdn_rnn(path, mdn_rnn, variant, history, autoencoder)
-        checkpoint.unlink()
+        checkpoint.unlink(missing_ok=True)  # there is none after 0 steps
 
 
 def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list, autoencoder: str | None = None) -> None:

@@ -183,6 +183,18 @@ def test_training_lowers_the_held_out_loss(quick_run):
     assert history[-1]["heldout"]["total"] < history[0]["heldout"]["total"]
 
 
+def test_no_steps_leave_an_m_with_the_weights_that_it_began_with(quick_run, tmp_path):
+    settings = Settings.preset("quick", m_steps=0)
+    shutil.copy(quick_run / "autoencoder.safetensors", tmp_path)
+    assert train_mdn_rnn("input_output", settings, quick_run / "rollouts", tmp_path)
+    assert not train_mdn_rnn("input_output", settings, quick_run / "rollouts", tmp_path)
+    untrained, facts = load_mdn_rnn(tmp_path / "mdn_rnn.safetensors", "input_output")
+    torch.manual_seed(settings.seed)
+    fresh = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
+    assert facts["history"] == []
+    assert all(untrained.state_dict()[name].equal(weights) for name, weights in fresh.state_dict().items())
+
+
 def test_an_interrupted_training_equals_an_uninterrupted_one_bit_for_bit(quick_run, tmp_path, interrupt_after):
     settings = Settings.preset("quick", m_steps=60)
     files = []
