@@ -78,7 +78,7 @@ def evolve(
     if log["best"] and kept == log["best"]["generation"] and len(log["generations"]) >= settings.generations:
         return False
     with locked(folder), threadpool_limits(1), worker_processes(settings.processes, executor) as executor:
-        seen = seen_parameters(settings.features, *sizes(world_model))
+        seen = searched(settings, world_model)
         strategy, means = resume(variant, settings, folder, log, world_model, kept)
         source = hand_out(executor, folder, variant)
         done = len(log["generations"])
@@ -126,14 +126,18 @@ def resume(
     strategy, means = replay(start_of_search(settings, world_model, folder), settings, log["generations"])
     if log["best"] and log["best"]["generation"] != kept:
         best = averaged_mean(means[: log["best"]["generation"]], settings)
-        seen = seen_parameters(settings.features, *sizes(world_model))
-        keep_controller(variant, folder, log, expand(best, seen), world_model)
+        keep_controller(variant, folder, log, expand(best, searched(settings, world_model)), world_model)
     return strategy, means
 
 
 def sizes(world_model: WorldModel) -> tuple[int, int]:
     """How many numbers z and h have."""
     return world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
+
+
+def searched(settings: Settings, world_model: WorldModel) -> np.ndarray:
+    """Which of C's parameters CMA-ES searches, those that act on what C sees: bool (parameters,)."""
+    return seen_parameters(settings.features, *sizes(world_model))
 
 
 def start_of_search(settings: Settings, world_model: WorldModel, folder: Path) -> np.ndarray:
@@ -145,7 +149,7 @@ def start_of_search(settings: Settings, world_model: WorldModel, folder: Path) -
     whole = initial_parameters(*sizes(world_model), settings.initial_gas)
     if settings.agent_episodes:
         whole = load_start(folder / START, world_model)
-    return whole[seen_parameters(settings.features, *sizes(world_model))]
+    return whole[searched(settings, world_model)]
 
 
 def load_start(path: Path, world_model: WorldModel) -> np.ndarray:

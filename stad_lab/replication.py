@@ -35,7 +35,7 @@ from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent / "records" / "table"
 KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every seed
-# World Models' own log: score of the best agent of a population of 64, 16 episodes each, against the episodes so far.
+# World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
 WORLD_MODELS = {25 * 64 * 16: 823.0, 50 * 64 * 16: 867.0, 200 * 64 * 16: 880.0, 1800 * 64 * 16: 900.5}
 TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
 TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes

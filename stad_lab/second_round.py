@@ -17,6 +17,7 @@ from stad_lab.agent import Agent, WorldModel, load_controller, read_world_model
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum, save_tensors
 from stad_lab.controller import ACTION_SIZE
+from stad_lab.drives import remember_drive
 from stad_lab.evolution import CONTROLLER, START, hand_out, load_start, make_agent
 from stad_lab.frames import to_frame
 from stad_lab.mdn_rnn import encode_frames
@@ -132,13 +133,10 @@ def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder:
     return True
 
 
-@torch.inference_mode()
 def features(world_model: WorldModel, frames: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """What C sees in an episode: z and the h before it, float32 (T, latent_size + hidden_size)."""
     latents = encode_frames(world_model.autoencoder, frames, world_model.stride)[0]
-    hidden, _ = world_model.mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)
-    before = np.concatenate([np.zeros_like(hidden[0, :1]), hidden[0, :-1].numpy()])
-    return np.concatenate([latents, before], axis=1)
+    return np.concatenate([latents, remember_drive(world_model.mdn_rnn, latents, actions)[0]], axis=1)
 
 
 def outputs(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
