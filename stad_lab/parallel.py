@@ -23,6 +23,7 @@ import cv2
 import torch
 
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # from glibc's malloc.h
+PRELOADED = ["stad_lab.pipeline"]  # what a worker imports: 2 to 4 seconds, of which PyTorch takes most
 TIME_LIMIT = 600.0  # seconds without any finished task, after which the workers count as stuck; a task takes some 10
 LOSSES = 3  # pools that may be lost in a row, before we stop to believe that it was an accident
 
@@ -37,6 +38,9 @@ class WorkerProcesses(Executor):
     A worker that is killed breaks Python's own pool for good. Here a new pool takes over what was not finished. The
     same happens if no task is finished for `time_limit` seconds: then the workers are stuck, and are killed.
 
+    The processes start with the first task. On Linux they are copies of a process that has imported the library and
+    done nothing else, as is Python's own way from 3.14 on, so that only the first pool has to wait for the imports.
+
     Raises:
         ValueError: fewer than 1 process.
     """
@@ -49,6 +53,7 @@ class WorkerProcesses(Executor):
         self.count, self.time_limit = count, time_limit
         self.lock, self.closed = threading.RLock(), threading.Event()
         self.losses, self.unfinished, self.last_sign = 0, 0, time.monotonic()
+        self.peak_memory = 0.0  # MB, of the largest process that was alive at the end
         self.pool = self._new_pool()
         threading.Thread(target=self._watch, daemon=True).start()
 
@@ -64,15 +69,22 @@ class WorkerProcesses(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         """As for every Executor."""
         self.closed.set()
+        for process in self._processes():
+            self.peak_memory = max(self.peak_memory, most_memory(process.pid))
         self.pool.shutdown(wait, cancel_futures=cancel_futures)
 
     def stop(self) -> None:
         """End the processes at once, whatever they do."""
-        for process in list((self.pool._processes or {}).values()):  # there is no public way to them before Python 3.14
+        for process in self._processes():
             process.kill()
 
+    def _processes(self) -> list[multiprocessing.Process]:
+        return list((self.pool._processes or {}).values())  # there is no public way to them
+
     def _new_pool(self) -> ProcessPoolExecutor:
-        context = multiprocessing.get_context("spawn")  # fork and torch's threads do not go together
+        # No copies of this process: it may have threads, and those of PyTorch would be missing in the copy.
+        context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
+        context.set_forkserver_preload(PRELOADED)
         return ProcessPoolExecutor(self.count, mp_context=context, initializer=start_worker)
 
     def _begin(self, task: Future, work: Callable) -> None:
@@ -203,22 +215,33 @@ def has_glibc() -> bool:
     return sys.platform == "linux" and platform.libc_ver()[0] == "glibc"
 
 
-def peak_memory() -> dict[str, float] | None:
-    """The most memory, in MB, that this process and the largest of its ended workers have held; None on Windows.
+def peak_memory(executor: Executor | None = None) -> dict[str, float] | None:
+    """The most memory, in MB, that this process and the largest process of an executor have held; None on Windows.
 
-    The worker's figure is an upper bound: on Linux a process begins with that of the process that started it.
+    The worker's is there only if there was one of this machine's. On Linux it includes what workers share (about
+    300 MB), elsewhere it is that of the largest worker of any executor so far.
     """
     if sys.platform == "win32":
         return None
-    import resource  # is not there on Windows
-
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes on Linux
-    most = {"process": resource.RUSAGE_SELF, "worker": resource.RUSAGE_CHILDREN}
-    most = {name: resource.getrusage(who).ru_maxrss * unit / 1e6 for name, who in most.items()}
+    worker = getattr(executor, "peak_memory", 0.0)
     if sys.platform == "linux":
-        status = Path("/proc/self/status").read_text()
-        most["process"] = int(status.split("VmHWM:")[1].split()[0]) * unit / 1e6
-    return {name: round(value, 1) for name, value in most.items()}
+        process = most_memory(os.getpid())
+    else:
+        import resource  # is not there on Windows
+
+        unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes elsewhere
+        process, worker = (
+            resource.getrusage(who).ru_maxrss * unit / 1e6 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+        )
+    return {"process": round(process, 1)} | ({"worker": round(worker, 1)} if worker else {})
+
+
+def most_memory(process: int) -> float:
+    """The most memory in MB that a process of this number has held so far; 0 if it has ended, or not on Linux."""
+    try:
+        return int(Path(f"/proc/{process}/status").read_text().split("VmHWM:")[1].split()[0]) * 1024 / 1e6
+    except (OSError, IndexError):
+        return 0.0
 
 
 def start_worker() -> None:

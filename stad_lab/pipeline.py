@@ -29,7 +29,7 @@ from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoenco
 from stad_lab.checkpoints import load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.evolution import LOG, START, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
-from stad_lab.parallel import peak_memory
+from stad_lab.parallel import peak_memory, worker_processes
 from stad_lab.rollouts import COLLECT_FIELDS, collect_rollouts
 from stad_lab.second_round import carry_over, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
@@ -82,36 +82,42 @@ def train(
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
     stages = {
-        "rollouts": lambda: collect_rollouts(settings, rollouts_folder, executor),
-        "autoencoder": lambda: train_autoencoder(variant, settings, rollouts_folder, folder),
-        "mdn_rnn": lambda: train_mdn_rnn(variant, settings, rollouts_folder, folder),
-        "controller": lambda: evolve(variant, settings, folder, executor),
+        "rollouts": lambda pool: collect_rollouts(settings, rollouts_folder, pool),
+        "autoencoder": lambda _: train_autoencoder(variant, settings, rollouts_folder, folder),
+        "mdn_rnn": lambda _: train_mdn_rnn(variant, settings, rollouts_folder, folder),
+        "controller": lambda pool: evolve(variant, settings, folder, pool),
     }
     if earlier is not None:
         again = (variant, settings, Path(earlier), rollouts_folder)
-        stages["rollouts"] = lambda: collect_again(*again, executor)
-        stages["controller"] = lambda: carry_over(*again, folder) | evolve(variant, settings, folder, executor)
+        stages["rollouts"] = lambda pool: collect_again(*again, pool)
+        stages["controller"] = lambda pool: carry_over(*again, folder) | evolve(variant, settings, folder, pool)
     with locked(folder):
         record = open_record(folder, variant, settings, earlier)
-        return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder)
+        return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder, executor)
 
 
 def run_stages(
-    stages: dict[str, Callable[[], bool]], wanted: Sequence[str], record: dict, folder: Path, rollouts_folder: Path
+    stages: dict[str, Callable[[Executor], bool]],
+    wanted: Sequence[str],
+    record: dict,
+    folder: Path,
+    rollouts_folder: Path,
+    executor: Executor | None,
 ) -> bool:
     """Run the wanted stages in order and keep the record of them; False if there was nothing to do."""
     worked = False
     for stage in wanted:
         begin, did = time.perf_counter(), True  # an interrupted stage has worked too
         try:
-            did = stages[stage]()
+            with worker_processes(record["settings"]["processes"], executor) as pool:
+                did = stages[stage](pool)
         except (ValueError, OSError):  # refused: what is in the folder stays as it is
             did = False
             raise
         finally:
             if did:
                 record["seconds"][stage] = record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
-                record.setdefault("peak_memory", {}).setdefault(stage, []).append(peak_memory())
+                record.setdefault("peak_memory", {}).setdefault(stage, []).append(peak_memory(pool))
                 save_json(folder / "record.json", record)
         print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
         worked |= did

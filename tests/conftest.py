@@ -8,12 +8,16 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # check_env tries render_mode
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels and commands too: the cores are shared by several tests
 os.environ.setdefault("TQDM_MININTERVAL", "1")  # a kernel's messages that nobody has read yet are dropped after 1,000
 
+import json
+import shutil
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
+from filelock import FileLock
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from stad_lab import load_agent, make_env
@@ -32,7 +36,9 @@ GUARD = """
 import os, sys
 
 def guard(event, arguments):
-    if event in ("socket.connect", "socket.bind", "socket.getaddrinfo"):
+    if event == "socket.getaddrinfo":
+        forbid(f"{event} {arguments}")
+    if event in ("socket.connect", "socket.bind") and not isinstance(arguments[1], str):  # a path: within the machine
         forbid(f"{event} {arguments}")
     if event == "open" and isinstance(arguments[0], str) and arguments[2] is not None:
         where = os.path.abspath(arguments[0])
@@ -56,17 +62,32 @@ def command_line():
 
 
 @pytest.fixture(scope="session")
-def quick_training(tmp_path_factory):
+def quick_training(tmp_path_factory, worker_id):
     """One run made by the real command: (its folder, the finished process, its duration in seconds)."""
+    shared = tmp_path_factory.getbasetemp()
+    if worker_id != "master":
+        shared = shared.parent  # of all processes of this test run: whoever comes first makes the run
+    told = shared / "quick_training.json"
+    with FileLock(shared / "quick_training.lock"):
+        if not told.exists():
+            told.write_text(json.dumps(train_quickly(shared / "quick", shared / "guard")))
+    outcome = json.loads(told.read_text())
+    assert outcome["returncode"] == 0, outcome["stderr"]
     folder = tmp_path_factory.mktemp("runs") / "quick"
-    guard = tmp_path_factory.mktemp("guard")
+    shutil.copytree(shared / "quick", folder)
+    return folder, SimpleNamespace(**outcome), outcome["seconds"]
+
+
+def train_quickly(folder, guard):
+    """Train with the quick settings under guard: what came of it, as a dictionary."""
+    guard.mkdir()
     (guard / "sitecustomize.py").write_text(GUARD)
     may_write = f"{folder}:{guard}:/dev/:/proc/"  # PyTorch looks for a place for temporary files
     guarded = {"GUARDED": may_write, "TMPDIR": str(guard), "PYTHONPATH": str(guard), "PYTHONDONTWRITEBYTECODE": "1"}
     begin = time.perf_counter()
     process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded)
-    assert process.returncode == 0, process.stderr
-    return folder, process, time.perf_counter() - begin
+    told = {name: getattr(process, name) for name in ("returncode", "stdout", "stderr")}
+    return told | {"seconds": time.perf_counter() - begin}
 
 
 @pytest.fixture(scope="session")
