@@ -23,7 +23,7 @@ from stad_lab.checkpoints import check_writable, load_json, save_json, write_byt
 from stad_lab.evaluation import describe, evaluate
 from stad_lab.parallel import TaskError
 from stad_lab.pipeline import STAGES, ship, train
-from stad_lab.replication import ROWS, describe_forecast, describe_row, forecast, keep, replicate
+from stad_lab.replication import FLOORS, ROWS, describe_forecast, describe_row, forecast, keep, replicate
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
 from stad_lab.study import study
@@ -110,7 +110,7 @@ def build_parser() -> argparse.ArgumentParser:
         description="Make one row of the table: V and M, a search for C for every seed, 100 official tracks for each C"
         " found. It says first how long it will take; stop it when you like, the same command goes on.",
     )
-    command.add_argument("--row", required=True, help=f"one of {', '.join(ROWS)}")
+    command.add_argument("--row", required=True, help=f"one of {', '.join([*ROWS, *FLOORS])}")
     command.add_argument("--out", required=True, type=Path, help="folder of all rows, for example runs/table")
     command.add_argument(
         "--keep", action="store_true", help="only copy the records of the finished seeds to stad_lab/records/table"

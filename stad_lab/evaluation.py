@@ -70,13 +70,18 @@ def evaluate(
         "variant": variant,
         "renderer": "fast" if fast else "official",
         "controller_sha256": checksum((folder / "controller.safetensors").read_bytes()),
-        **summarise(returns),
+        **report(tracks, returns, frames),
         "seconds": time.perf_counter() - begin,
-        "episodes": [
-            {"track": track, "return": float(value), "frames": int(length)}
-            for track, value, length in zip(tracks, returns, frames, strict=True)
-        ],
     }
+
+
+def report(tracks: list[int], returns: np.ndarray, frames: np.ndarray) -> dict:
+    """What `summarise` says of the returns, float (n,), and every episode: its track, return and frames, (n,) each."""
+    episodes = [
+        {"track": track, "return": float(value), "frames": int(length)}
+        for track, value, length in zip(tracks, returns, frames, strict=True)
+    ]
+    return {**summarise(returns), "episodes": episodes}
 
 
 def summarise(returns: np.ndarray) -> dict:

@@ -7,7 +7,8 @@ drives every C found on the official tracks. In the folder of a row::
     world/      rollouts, V and M
     seed0/ ...  V, M and C of one search, with its log, record.json and evaluation.json
 
-Whatever is there already is not done again. The records that we report lie in `stad_lab/records/table`.
+The rows of FLOORS are drivers that do not look at the road. Whatever is there already is not done again. The records
+that we report lie in `stad_lab/records/table`.
 """
 
 import dataclasses
@@ -19,22 +20,28 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tqdm.auto import tqdm
 
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder, save_autoencoder
 from stad_lab.benchmark import train_m, train_v
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import load_json, save_json
-from stad_lab.controller import initial_parameters
-from stad_lab.evaluation import SOLVED, evaluate
+from stad_lab.controller import initial_parameters, squash
+from stad_lab.evaluation import SOLVED, evaluate, report
+from stad_lab.evaluation import summarise as summarise_episodes
 from stad_lab.evolution import CONTROLLER, LOG, drive_generation
 from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
-from stad_lab.parallel import worker_processes
-from stad_lab.pipeline import total_budget, train
-from stad_lab.rollouts import collect_rollouts
+from stad_lab.parallel import run_tasks, worker_processes
+from stad_lab.pipeline import provenance, total_budget, train
+from stad_lab.rollouts import RandomDriver, collect_rollouts
 from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent / "records" / "table"
-KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every seed
+KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every seed, as far as it has them
+FLOORS = {  # rows of drivers that do not look at the road
+    "random_driver": "smooth random steering and gas, as for the rollouts",
+    "gentle_driver": "straight on with little gas, as the first agent that evolution tries",
+}
 # World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
 WORLD_MODELS = {25 * 64 * 16: 823.0, 50 * 64 * 16: 867.0, 200 * 64 * 16: 880.0, 1800 * 64 * 16: 900.5}
 TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
@@ -99,7 +106,7 @@ def replicate(name: str, folder: str | Path, executor: Executor | None = None) -
     """Make one row of the table, or what is missing of it; run it again after an interrupt to go on.
 
     Args:
-        name: one of ROWS.
+        name: one of ROWS or FLOORS.
         folder: of all rows; this one goes into `folder/name`.
         executor: who drives; None for processes of this machine.
 
@@ -110,6 +117,8 @@ def replicate(name: str, folder: str | Path, executor: Executor | None = None) -
         ValueError: an unknown row, or a folder with something else in it.
         OSError, TaskError, FloatingPointError: as `train` and `evaluate`.
     """
+    if name in FLOORS:
+        return drive_floor(name, Path(folder) / name / "seed0", executor)
     row, folder = find_row(name), Path(folder)
     first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
     for seed in row.seeds:
@@ -120,8 +129,44 @@ def replicate(name: str, folder: str | Path, executor: Executor | None = None) -
 def find_row(name: str) -> Row:
     """The row of a name. Raises ValueError if there is none."""
     if name not in ROWS:
-        raise ValueError(f"unknown row {name!r}: choose one of {', '.join(ROWS)}")
+        raise ValueError(f"unknown row {name!r}: choose one of {', '.join([*ROWS, *FLOORS])}")
     return ROWS[name]
+
+
+def drive_floor(name: str, folder: Path, executor: Executor | None) -> dict:
+    """Drive the official tracks without looking, and write `evaluation.json` and a record."""
+    if not (folder / "evaluation.json").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        begin, tracks = time.perf_counter(), list(range(TRACKS))
+        with worker_processes(Settings().processes, executor) as executor:
+            tasks = [(name, track) for track in tracks]
+            found = dict(tqdm(run_tasks(executor, drive_blindly, tasks), name, TRACKS, unit="episode"))
+        returns, frames = (np.array(part) for part in zip(*(found[track] for track in tracks), strict=True))
+        told = {"variant": name, "renderer": "none: it does not look"} | report(tracks, returns, frames)
+        record = {"variant": name, "made_with": provenance(f"python -m stad_lab replicate --row {name} --out ...")}
+        save_json(folder / "record.json", record | {"budget": {}})
+        save_json(folder / "evaluation.json", told | {"seconds": time.perf_counter() - begin})
+    return summarise([folder])
+
+
+def drive_blindly(name: str, track: int) -> tuple[float, int]:
+    """Drive an official track as a row of FLOORS: (return, frames). Runs in a worker process.
+
+    Rewards do not depend on the renderer, so the fast one serves.
+    """
+    driver, gentle = (
+        RandomDriver(np.random.default_rng([0, track])),
+        squash(np.array([0.0, Settings().initial_gas, 0.0])),
+    )
+    env = make_env(fast=True)
+    env.reset(seed=track)
+    total, frames, ended = 0.0, 0, False
+    while not ended:
+        action = driver.act() if name == "random_driver" else gentle
+        _, reward, terminated, truncated, _ = env.step(action.astype(np.float32))
+        total, frames, ended = total + reward, frames + 1, terminated or truncated
+    env.close()
+    return total, frames
 
 
 def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path | None, Path]:
@@ -148,13 +193,14 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
 def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders."""
     kept = []
-    for seed in find_row(name).seeds:
+    for seed in (0,) if name in FLOORS else find_row(name).seeds:
         source = Path(folder) / name / f"seed{seed}"
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
             kept[-1].mkdir(parents=True, exist_ok=True)
             for file in KEPT:
-                shutil.copyfile(source / file, kept[-1] / file)
+                if (source / file).exists():
+                    shutil.copyfile(source / file, kept[-1] / file)
     return kept
 
 
@@ -187,11 +233,9 @@ def summarise(folders: list[Path]) -> dict:
     returns = np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
     budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
     return {
-        "mean": float(returns.mean()),
-        "standard_deviation": float(returns.std(ddof=1)),
+        **summarise_episodes(returns.ravel()),
         "interval": bootstrap(returns),
         "seeds": returns.mean(axis=1).tolist(),
-        "above_900": float((returns > SOLVED).mean()),
         "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
         **{unit: float(np.mean([spent[unit] for spent in budgets])) for unit in ("agents", "episodes", "frames")},
     }
@@ -214,6 +258,8 @@ def forecast(name: str) -> dict[str, float]:
 
     An agent's episode is taken to have as many frames as it may have at most, so the searches may be quicker.
     """
+    if name in FLOORS:
+        return {"evaluations": TRACKS * 1000 / (Settings().processes * blind_speed(name))}
     row = find_row(name)
     with tempfile.TemporaryDirectory() as folder:
         speed = speeds(row, Path(folder))
@@ -262,6 +308,12 @@ def speeds(row: Row, folder: Path) -> dict[str, float]:
         "V": train_v(False, settings.width, folder / "rollouts", 0, steps=12)[0],
         "M": train_m(False, 0, steps=6, batch=settings.m_batch // 4),
     }
+
+
+def blind_speed(name: str) -> float:
+    """Frames a second that a driver of FLOORS drives here."""
+    begin = time.perf_counter()
+    return drive_blindly(name, 0)[1] / (time.perf_counter() - begin)
 
 
 def describe_forecast(name: str, times: dict[str, float]) -> str:

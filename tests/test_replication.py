@@ -14,6 +14,7 @@ from stad_lab.evolution import fitness_curves
 from stad_lab.pipeline import total_budget
 from stad_lab.plots import plot_episodes, plot_seeds
 from stad_lab.replication import (
+    FLOORS,
     ROWS,
     WORLD_MODELS,
     Row,
@@ -27,8 +28,9 @@ from stad_lab.replication import (
 )
 from stad_lab.settings import Settings
 
-FIRST = Settings.preset("quick", processes=1)
-SECOND = Settings.preset("quick", agent_episodes=2, processes=1)
+TINY = {"processes": 1, "generations": 2, "v_steps": 8, "m_steps": 4}
+FIRST = Settings.preset("quick", **TINY)
+SECOND = Settings.preset("quick", **TINY | {"agent_episodes": 2, "generations": 4})
 
 
 @pytest.fixture(scope="module")
@@ -37,10 +39,10 @@ def table(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ROWS, "two", Row("input", "two rounds", SECOND, FIRST, seeds=(0, 1)))
         patch.setitem(
-            ROWS, "blind", Row("input", "no M", Settings.preset("quick", features="z"), seeds=(3,), world="one")
+            ROWS, "blind", Row("input", "no M", Settings.preset("quick", **TINY, features="z"), seeds=(3,), world="one")
         )
         patch.setitem(ROWS, "one", Row("input", "one round", FIRST, seeds=(0,)))
-        patch.setattr(replication, "TRACKS", 2)
+        patch.setattr(replication, "TRACKS", 1)
         patch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
         folder = tmp_path_factory.mktemp("table")
         with ThreadPoolExecutor(1) as executor:
@@ -79,17 +81,17 @@ def test_a_lost_evaluation_is_driven_again_to_the_same_numbers(table):
 def test_the_summary_counts_every_episode_that_was_driven_for_a_seed(table):
     folder, summaries = table
     record = load_json(folder / "two" / "seed0" / "record.json")
-    # 8 random ones, 4 generations of 4 agents and 2 looks at 2 tracks; 2 by the agent, and the other two again.
-    assert summaries["two"]["episodes"] == 8 + 16 + 4 + 2 + 16 + 4 == total_budget(record)["episodes"]
-    assert summaries["two"]["agents"] == 32
-    assert len(summaries["two"]["seeds"]) == 2 and summaries["blind"]["episodes"] == 8 + 16 + 4
+    # 8 random ones, 2 generations of 4 agents and a look at 2 tracks; 2 by the agent, 4 generations and 2 looks.
+    assert summaries["two"]["episodes"] == 8 + 8 + 2 + 2 + 16 + 4 == total_budget(record)["episodes"]
+    assert summaries["two"]["agents"] == 8 + 16
+    assert len(summaries["two"]["seeds"]) == 2 and summaries["blind"]["episodes"] == 8 + 8 + 2
 
 
 def test_a_learning_curve_ends_at_all_the_episodes_of_its_seed(table):
     folder, summaries = table
     curves = [learning_curve(folder / "two" / f"seed{seed}") for seed in (0, 1)]
     for episodes, scores in curves:
-        assert episodes.tolist() == [8 + 16 + 4 + 2 + 8 + 2, summaries["two"]["episodes"]] and len(scores) == 2
+        assert episodes.tolist() == [8 + 8 + 2 + 2 + 8 + 2, summaries["two"]["episodes"]] and len(scores) == 2
     figure = plot_episodes({"two": curves}, {"World Models (v0)": WORLD_MODELS}, "Score")
     (axis,) = figure.axes
     assert axis.get_xscale() == "log" and axis.get_xlim()[1] > 1_800_000
@@ -116,12 +118,13 @@ def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     assert len(sizes) == 8 and max(sizes) < 200_000  # neither V nor M
 
 
-def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long():
-    times = forecast("one_round")
+def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long(monkeypatch):
+    monkeypatch.setitem(ROWS, "one", Row("input", "one round", Settings.preset("quick", v_batch=128, m_batch=64)))
+    times = forecast("one")
     assert all(times[part] > 0 for part in ("rollouts", "V", "M", "searches", "evaluations"))
-    assert times["first search"] == 0 and times["searches"] > times["evaluations"]
-    line = describe_forecast("one_round", times)
-    assert line.startswith("one_round: at most ") and "searches" in line and "first search" not in line
+    assert times["first search"] == 0 and times["evaluations"] > times["searches"]  # whole episodes against brief ones
+    line = describe_forecast("one", times)
+    assert line.startswith("one: at most ") and "searches" in line and "first search" not in line
 
 
 def test_every_row_has_the_budget_that_the_table_promises():
@@ -159,3 +162,15 @@ def test_an_unknown_row_ends_in_one_line_that_names_the_rows(capsys, tmp_path):
 def test_the_command_keeps_what_is_finished(tmp_path, capsys):
     assert main(["replicate", "--row", "one_round", "--out", str(tmp_path), "--keep"]) == 0
     assert "no seed is finished" in capsys.readouterr().out
+
+
+def test_a_driver_that_does_not_look_is_a_row_like_any_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(replication, "TRACKS", 3)
+    with ThreadPoolExecutor(1) as executor:
+        found = {name: replicate(name, tmp_path, executor) for name in FLOORS}
+    for name, row in found.items():
+        told = load_json(tmp_path / name / "seed0" / "evaluation.json")
+        assert [episode["track"] for episode in told["episodes"]] == [0, 1, 2] and told["mean"] == row["mean"] < 200
+        assert row["episodes"] == 0 and keep(name, tmp_path, tmp_path / "kept")
+        assert replicate(name, tmp_path) == row and "evaluations" in describe_forecast(name, forecast(name))
+    assert found["random_driver"]["mean"] != found["gentle_driver"]["mean"]
