@@ -208,6 +208,26 @@ def plot_intervals(
     return figure
 
 
+def plot_stacks(stacks: dict[str, dict[str, float]], title: str, xlabel: str) -> Figure:
+    """Sums and what they are made of: name -> part -> value, a bar for each name, a colour for each part."""
+    figure, ((axis,),) = new_figure(7.5, 0.42 * len(stacks) + 1.5)
+    for place, parts in enumerate(stacks.values()):
+        left = 0.0
+        for (part, value), color in zip(parts.items(), (BLUE, ORANGE, GREEN), strict=False):
+            axis.barh(place, value, left=left, color=color, height=0.6, label=part if place == 0 else None)
+            left += value
+        axis.text(left, place, f" {left:.0f}", va="center", fontsize=9)
+    axis.set(xlabel=xlabel, yticks=range(len(stacks)), yticklabels=list(stacks), ylim=(len(stacks) - 0.5, -0.5))
+    axis.margins(x=0.1)
+    axis.legend(frameon=False, fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3)
+    figure.suptitle(title, fontsize=11)
+    told = "; ".join(
+        f"{name}: {', '.join(f'{part} {value:.0f}' for part, value in parts.items())}" for name, parts in stacks.items()
+    )
+    figure.set_label(f"{title}. {told}.")
+    return figure
+
+
 def plot_rate_distortion(rates: np.ndarray, errors: np.ndarray, names: list[str], title: str) -> Figure:
     """What a latent tells (rate, nats) against what the drawing misses (distortion): a named point for each V."""
     figure, ((axis,),) = new_figure(6.5, 3.4)

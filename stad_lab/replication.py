@@ -44,6 +44,7 @@ FLOORS = {  # rows of drivers that do not look at the road
 }
 # World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
 WORLD_MODELS = {25 * 64 * 16: 823.0, 50 * 64 * 16: 867.0, 200 * 64 * 16: 880.0, 1800 * 64 * 16: 900.5}
+PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # its table, on CarRacing-v0
 TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
 TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
 RESAMPLES = 10_000
@@ -202,6 +203,22 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
                 if (source / file).exists():
                     shutil.copyfile(source / file, kept[-1] / file)
     return kept
+
+
+def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
+    """The rows that have been made: name -> folders of its seeds, in the order of FLOORS and ROWS."""
+    found = {name: sorted((records / name).glob("seed*")) for name in [*FLOORS, *ROWS]}
+    return {name: folders for name, folders in found.items() if folders}
+
+
+def lost_points(folders: list[Path]) -> dict[str, float]:
+    """Where the points up to 1,000 went, mean of all episodes: {"time": 0.1 a frame, "tiles": all else}.
+
+    All else is the tiles not visited, and the 100 points for leaving the field.
+    """
+    episodes = [episode for folder in folders for episode in load_json(folder / "evaluation.json")["episodes"]]
+    returns, frames = (np.array([episode[name] for episode in episodes]) for name in ("return", "frames"))
+    return {"time": float(0.1 * frames.mean()), "tiles": float((1000 - returns - 0.1 * frames).mean())}
 
 
 def learning_curve(folder: Path) -> tuple[np.ndarray, np.ndarray]:

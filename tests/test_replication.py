@@ -1,5 +1,6 @@
 """The table: one command makes a row and goes on with it, and its interval covers the truth."""
 
+import dataclasses
 import functools
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,11 +9,11 @@ import pytest
 
 from stad_lab import replication
 from stad_lab.__main__ import main
-from stad_lab.checkpoints import load_json
+from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import fitness_curves
 from stad_lab.pipeline import total_budget
-from stad_lab.plots import plot_episodes, plot_seeds
+from stad_lab.plots import plot_episodes, plot_seeds, plot_stacks
 from stad_lab.replication import (
     FLOORS,
     ROWS,
@@ -22,7 +23,9 @@ from stad_lab.replication import (
     describe_forecast,
     forecast,
     keep,
+    kept_rows,
     learning_curve,
+    lost_points,
     replicate,
     summarise,
 )
@@ -174,3 +177,26 @@ def test_a_driver_that_does_not_look_is_a_row_like_any_other(tmp_path, monkeypat
         assert row["episodes"] == 0 and keep(name, tmp_path, tmp_path / "kept")
         assert replicate(name, tmp_path) == row and "evaluations" in describe_forecast(name, forecast(name))
     assert found["random_driver"]["mean"] != found["gentle_driver"]["mean"]
+
+
+def test_lost_points_and_the_mean_make_a_thousand(tmp_path):
+    episodes = [{"track": 0, "return": 890.0, "frames": 900}, {"track": 1, "return": -130.0, "frames": 300}]
+    save_json(tmp_path / "evaluation.json", {"episodes": episodes})
+    assert lost_points([tmp_path]) == {"time": 60.0, "tiles": pytest.approx((20 + 1100) / 2)}
+    figure = plot_stacks({"agent": lost_points([tmp_path])}, "Lost", "points")
+    assert figure.get_label() == "Lost. agent: time 60, tiles 560."
+
+
+def test_every_row_that_we_report_holds_its_protocol():
+    kept = kept_rows()
+    assert set(FLOORS) <= set(kept)
+    for name, folders in kept.items():
+        for folder in folders:
+            told, record = load_json(folder / "evaluation.json"), load_json(folder / "record.json")
+            assert [episode["track"] for episode in told["episodes"]] == list(range(100))
+            assert record["made_with"]["uncommitted_changes"] is False
+            if name in ROWS:
+                row = dataclasses.replace(ROWS[name].settings, evolution_seed=int(folder.name.removeprefix("seed")))
+                assert record["settings"] == row.as_dict() and told["renderer"] == "official"
+                assert told["controller_sha256"] == checksum((folder / "controller.safetensors").read_bytes())
+                assert total_budget(record)["episodes"] <= 4800 or name.startswith("paper")
