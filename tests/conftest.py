@@ -15,12 +15,15 @@ import sys
 import time
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from filelock import FileLock
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from stad_lab import load_agent, make_env
+from stad_lab.agent import load_controller
+from stad_lab.checkpoints import save_tensors
 
 torch.set_num_threads(1)  # the models here are tiny: more threads would only get in each other's way
 
@@ -94,6 +97,19 @@ def train_quickly(folder, guard):
 def quick_run(quick_training):
     """The folder of a finished run. Tests that change files copy it first."""
     return quick_training[0]
+
+
+@pytest.fixture(scope="session")
+def straight_run(quick_run, tmp_path_factory):
+    """The run with a C whose sight reaches the gas alone: it goes straight on, and off the field in some 300 frames."""
+    folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("runs") / "straight")
+    evolved, facts = load_controller(folder / "controller.safetensors", "input_output")
+    straight = np.zeros_like(evolved)
+    gas = straight[:-3].reshape(3, -1)[1]
+    gas[:] = 0.02 * np.random.default_rng(0).standard_normal(gas.shape)
+    straight[-2] = -0.2  # the gas of a blind driver would be 0.4
+    save_tensors(folder / "controller.safetensors", {"parameters": torch.from_numpy(straight)}, **facts)
+    return folder
 
 
 @pytest.fixture

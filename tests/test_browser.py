@@ -283,6 +283,7 @@ def generation(picture):
     return int(re.search(r"generation (\d+)", picture.get_attribute("alt"))[1])
 
 
+@pytest.mark.long
 def test_the_first_notebook_runs_to_its_end_in_the_browser(run, lab):
     name = "00_first_drive.ipynb"
     page = run(name=name, content=json.loads((NOTEBOOKS / name).read_text()))

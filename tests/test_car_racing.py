@@ -111,7 +111,7 @@ def test_rewards_equal_to_the_last_bit_to_the_end_of_a_lap():
 
 
 def test_pictures_of_20_episodes_are_gymnasium_s_to_half_a_level_and_around_the_car_to_four():
-    episodes = [compare_pictures(number, frames=60) for number in range(20)]
+    episodes = [compare_pictures(number, frames=40) for number in range(20)]
     assert all(equal for _, equal in episodes)
     whole, window, bar = np.concatenate([errors for errors, _ in episodes]).mean(axis=0)
     assert whole <= 0.5

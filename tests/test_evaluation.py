@@ -13,20 +13,20 @@ TRACK = 3
 
 
 @pytest.fixture(scope="module")
-def official(quick_run):
+def official(straight_run):
     """One whole episode with Gymnasium's own renderer."""
-    return evaluate("input_output", quick_run, episodes=1, first_track=TRACK, processes=1)
+    return evaluate("input_output", straight_run, episodes=1, first_track=TRACK, processes=1)
 
 
 @pytest.fixture(scope="module")
-def fast(quick_run):
+def fast(straight_run):
     """Two whole episodes with the fast renderer."""
-    return evaluate("input_output", quick_run, episodes=2, first_track=10, fast=True)
+    return evaluate("input_output", straight_run, episodes=2, first_track=10, fast=True)
 
 
-def test_a_script_with_gymnasium_alone_finds_the_same_return(official, quick_run):
+def test_a_script_with_gymnasium_alone_finds_the_same_return(official, straight_run):
     env = gymnasium.make("CarRacing-v3")
-    agent = load_agent("input_output", quick_run)
+    agent = load_agent("input_output", straight_run)
     observation, _ = env.reset(seed=TRACK)
     agent.reset()
     total = frames = 0
@@ -35,6 +35,7 @@ def test_a_script_with_gymnasium_alone_finds_the_same_return(official, quick_run
         observation, reward, terminated, truncated, _ = env.step(agent.act(observation))
         total, frames, ended = total + reward, frames + 1, terminated or truncated
     assert official["renderer"] == "official"
+    assert 200 < frames < 1000 and terminated  # off the field, at the cost of 100
     assert official["episodes"] == [{"track": TRACK, "return": pytest.approx(total, abs=1e-6), "frames": frames}]
 
 
@@ -48,8 +49,8 @@ def test_every_episode_is_on_record(fast):
     assert (fast["variant"], fast["renderer"]) == ("input_output", "fast")
 
 
-def test_an_evaluation_goes_to_the_screen_and_to_a_file(quick_run, fast, tmp_path, command_line):
-    arguments = ["evaluate", "--variant", "input_output", "--path", quick_run, "--fast", "--episodes", 2]
+def test_an_evaluation_goes_to_the_screen_and_to_a_file(straight_run, fast, tmp_path, command_line):
+    arguments = ["evaluate", "--variant", "input_output", "--path", straight_run, "--fast", "--episodes", 2]
     process = command_line(*arguments, "--first-track", 10, "--processes", 1, "--json", tmp_path / "result.json")
     assert process.returncode == 0, process.stderr
     result = load_json(tmp_path / "result.json")
@@ -93,7 +94,7 @@ def test_one_episode_has_no_deviation():
 
 
 @pytest.mark.parametrize(("first", "episodes"), [(-1, 1), (TRACK_RANGES["test"][1], 1), (999_950, 100), (0, 0)])
-def test_tracks_outside_the_test_range_are_refused(first, episodes, quick_run):
+def test_tracks_outside_the_test_range_are_refused(first, episodes, straight_run):
     message = f"episodes={episodes} from first_track={first}: expected at least 1 episode, on tracks 0 to 999999"
     with pytest.raises(ValueError, match=message):
-        evaluate("input_output", quick_run, episodes, first)
+        evaluate("input_output", straight_run, episodes, first)
