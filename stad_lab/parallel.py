@@ -84,7 +84,8 @@ class WorkerProcesses(Executor):
     def _new_pool(self) -> ProcessPoolExecutor:
         # No copies of this process: it may have threads, and those of PyTorch would be missing in the copy.
         context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
-        context.set_forkserver_preload(PRELOADED)
+        if sys.platform == "linux":
+            context.set_forkserver_preload(PRELOADED)
         return ProcessPoolExecutor(self.count, mp_context=context, initializer=start_worker)
 
     def _begin(self, task: Future, work: Callable) -> None:

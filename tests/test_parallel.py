@@ -1,11 +1,12 @@
-"""Memory: kept for the next step, but not without bound."""
+"""Workers: where they come from, and memory that is kept for the next step, but not without bound."""
 
+import os
 import subprocess
 import sys
 
 import pytest
 
-from stad_lab.parallel import has_glibc
+from stad_lab.parallel import has_glibc, peak_memory, run_tasks, worker_processes
 
 FREED = """
 import numpy as np
@@ -25,6 +26,24 @@ still = held() - begin
 return_freed_memory(above=100e6)
 print(kept, still, held() - begin)
 """
+
+
+def tell_parent():
+    """A task: the process that started this worker, and whether the library had been imported there."""
+    return os.getppid(), "stad_lab.pipeline" in sys.modules
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers import what they need themselves")
+def test_the_workers_of_all_pools_come_from_one_process_that_has_imported_the_library():
+    parents = []
+    for _ in range(2):
+        with worker_processes(1) as executor:
+            ((_, (parent, imported)),) = run_tasks(executor, tell_parent, [()])
+        assert imported and parent != os.getpid()
+        parents.append(parent)
+        assert 50 < peak_memory(executor)["worker"] < 3000
+    assert parents[0] == parents[1]
+    assert "worker" not in peak_memory()
 
 
 @pytest.mark.skipif(not has_glibc(), reason="only glibc is told to keep memory")
