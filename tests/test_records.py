@@ -4,6 +4,8 @@ import json
 import re
 from pathlib import Path
 
+from stad_lab.replication import ROWS, kept_rows, summarise
+
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
 README = (Path(__file__).parent.parent / "README.md").read_text()
 CLUSTER = (Path(__file__).parent.parent / "docs" / "cluster.md").read_text()
@@ -53,3 +55,16 @@ def test_the_cluster_page_says_what_the_record_says():
         f"{100 * efficiency['1,024 workers']:.0f}%",
     ):
         assert re.search(rf"(?<![\d.,]){re.escape(number)}", CLUSTER), number
+
+
+def test_the_readme_s_rows_are_the_replication_s():
+    kept = kept_rows()
+    assert kept
+    for name, folders in kept.items():
+        found = summarise(folders)
+        planned = len(ROWS[name].seeds) if name in ROWS else 1
+        seeds = f"{len(folders)}" + (f" of {planned}" if len(folders) < planned else "")
+        low, high = found["interval"]
+        counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}"]
+        scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
+        assert cells(f"`{name}`") == [seeds, *scores, *counts]
