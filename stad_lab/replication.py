@@ -88,7 +88,7 @@ def make_rows() -> dict[str, Row]:
     return rows
 
 
-# Two ways to spend 64 episodes on a generation. With the first one, on validation tracks, our recipe came further.
+# Two ways to spend 64 episodes on a generation. With the first one, on validation tracks, our recipe learned faster.
 MANY, FEW = {"population": 64, "tracks": 1}, {"population": 16, "tracks": 4}
 # Name -> what it is, the change of the "one_round" recipe, and whether V is the same.
 ABLATIONS = {
