@@ -220,7 +220,7 @@ def peak_memory(executor: Executor | None = None) -> dict[str, float] | None:
     """The most memory, in MB, that this process and the largest process of an executor have held; None on Windows.
 
     The worker's is there only if there was one of this machine's. On Linux it includes what workers share (about
-    300 MB), elsewhere it is that of the largest worker of any executor so far.
+    170 MB), elsewhere it is that of the largest worker of any executor so far.
     """
     if sys.platform == "win32":
         return None

@@ -24,6 +24,8 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 from stad_lab import load_agent, make_env
 from stad_lab.agent import load_controller
 from stad_lab.checkpoints import save_tensors
+from stad_lab.controller import initial_parameters
+from stad_lab.settings import Settings
 
 torch.set_num_threads(1)  # the models here are tiny: more threads would only get in each other's way
 
@@ -103,11 +105,11 @@ def quick_run(quick_training):
 def straight_run(quick_run, tmp_path_factory):
     """The run with a C whose sight reaches the gas alone: it goes straight on, and off the field in some 300 frames."""
     folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("runs") / "straight")
-    evolved, facts = load_controller(folder / "controller.safetensors", "input_output")
-    straight = np.zeros_like(evolved)
+    _, facts = load_controller(folder / "controller.safetensors", "input_output")
+    quick = Settings.preset("quick")
+    straight = initial_parameters(quick.latent_size, quick.hidden_size, gas=-0.2)  # 0.4, were the driver blind
     gas = straight[:-3].reshape(3, -1)[1]
     gas[:] = 0.02 * np.random.default_rng(0).standard_normal(gas.shape)
-    straight[-2] = -0.2  # the gas of a blind driver would be 0.4
     save_tensors(folder / "controller.safetensors", {"parameters": torch.from_numpy(straight)}, **facts)
     return folder
 

@@ -50,18 +50,17 @@ def test_the_command_measures_m_against_simple_forecasts_and_lesser_m_s(measured
 
 
 def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_run):
-    folder = measured
     world_model = read_world_model(run_folder("input"), "input")
     rng = np.random.default_rng(0)
     z, actions = rng.standard_normal((4, 20, 32), np.float32), rng.random((4, 20, 3), np.float32)
-    arguments = (Settings.preset("quick"), quick_run / "rollouts", folder, world_model, z, actions)
+    arguments = (Settings.preset("quick"), quick_run / "rollouts", measured, world_model, z, actions)
     first = lesser_forecasts(*arguments)
-    kept = (folder / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns
-    shutil.rmtree(folder / "no_memory")  # as if it had been stopped before
+    kept = (measured / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns
+    shutil.rmtree(measured / "no_memory")  # as if it had been stopped before
     again = lesser_forecasts(*arguments)
     assert all(np.array_equal(first[name], again[name]) for name in CONTENDERS)
-    assert (folder / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns == kept
-    assert not list(folder.glob("*/*.training.safetensors"))
+    assert (measured / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns == kept
+    assert not list(measured.glob("*/*.training.safetensors"))
 
 
 def test_an_unknown_part_is_refused_before_any_work(tmp_path):
