@@ -23,10 +23,9 @@ def initial_parameters(latent_size: int, hidden_size: int, gas: float = 0.0) -> 
     return parameters
 
 
-def seen_parameters(features: str, latent_size: int, hidden_size: int) -> np.ndarray:
-    """Which parameters act on what C sees, for `Settings.features`: bool (parameters,). The others stay zero."""
-    columns = np.repeat(["z" in features, "h" in features], [latent_size, hidden_size])
-    return np.concatenate([np.tile(columns, ACTION_SIZE), np.ones(ACTION_SIZE, bool)])
+def seen_columns(features: str, latent_size: int, hidden_size: int) -> np.ndarray:
+    """Which of z and h C sees, for `Settings.features`: bool (latent_size + hidden_size,). Other weights are 0."""
+    return np.repeat(["z" in features, "h" in features], [latent_size, hidden_size])
 
 
 def check_parameters(parameters: np.ndarray, count: int, source: str | Path = "controller") -> None:

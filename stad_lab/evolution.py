@@ -28,18 +28,17 @@ from stad_lab.agent import (
     read_world_model,
     save_controller,
 )
-from stad_lab.checkpoints import load_json, load_tensors, locked, save_json
-from stad_lab.controller import check_parameters, initial_parameters, parameter_count, seen_parameters
+from stad_lab.checkpoints import load_json, locked, save_json
 from stad_lab.mdn_rnn import check_partner
 from stad_lab.parallel import return_freed_memory, run_tasks, work_alone, worker_processes
 from stad_lab.rollouts import track_seeds
+from stad_lab.search_space import SearchSpace, search_space
 from stad_lab.settings import Settings, check_same_run
 
 if TYPE_CHECKING:
     import cma
 
 LOG = "evolution.json"
-START = "start.safetensors"
 CONTROLLER = "controller.safetensors"
 
 
@@ -78,18 +77,18 @@ def evolve(
     if log["best"] and kept == log["best"]["generation"] and len(log["generations"]) >= settings.generations:
         return False
     with locked(folder), threadpool_limits(1), worker_processes(settings.processes, executor) as executor:
-        seen = searched(settings, world_model)
-        strategy, means = resume(variant, settings, folder, log, world_model, kept)
+        space = search_space(settings, world_model, folder)
+        strategy, means = resume(variant, settings, folder, log, world_model, space, kept)
         source = hand_out(executor, folder, variant)
         done = len(log["generations"])
         progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
         for generation in progress:
-            entry = run_generation(generation, strategy, means, seen, executor, source, variant, settings)
+            entry = run_generation(generation, strategy, means, space, executor, source, variant, settings)
             log["generations"].append(entry)
             better = note_best(log)
             save_json(folder / LOG, log)
             if better:  # after the log: a controller that the log does not know would be a stranger
-                keep_controller(variant, folder, log, expand(averaged_mean(means, settings), seen), world_model)
+                keep_controller(variant, folder, log, space.expand(averaged_mean(means, settings)), world_model)
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
             if watch:
@@ -101,71 +100,39 @@ def run_generation(
     generation: int,
     strategy: "cma.CMAEvolutionStrategy",
     means: list[np.ndarray],
-    seen: np.ndarray,
+    space: SearchSpace,
     executor: Executor,
     source: Any,
     variant: str,
     settings: Settings,
 ) -> dict:
     """Ask for a population, let it drive, and tell its fitness; adds to the means, returns the log's entry."""
-    population = np.array(strategy.ask())
-    entry = drive_generation(executor, source, variant, settings, generation, expand(population, seen))
+    population = ask(strategy, settings, generation)
+    entry = drive_generation(executor, source, variant, settings, generation, space.expand(population))
     strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
     means.append(strategy.mean.copy())
     entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
     if (generation + 1) % settings.validate_every == 0:
-        controller = expand(averaged_mean(means, settings), seen)
+        controller = space.expand(averaged_mean(means, settings))
         entry["validation"] = validate(executor, source, variant, settings, controller)
     return entry
 
 
 def resume(
-    variant: str, settings: Settings, folder: Path, log: dict, world_model: WorldModel, kept: int | None
+    variant: str,
+    settings: Settings,
+    folder: Path,
+    log: dict,
+    world_model: WorldModel,
+    space: SearchSpace,
+    kept: int | None,
 ) -> tuple["cma.CMAEvolutionStrategy", list[np.ndarray]]:
     """The strategy and its means as the log left them; makes `controller.safetensors` again if it is not the best."""
-    strategy, means = replay(start_of_search(settings, world_model, folder), settings, log["generations"])
+    strategy, means = replay(space.first, settings, log["generations"])
     if log["best"] and log["best"]["generation"] != kept:
         best = averaged_mean(means[: log["best"]["generation"]], settings)
-        keep_controller(variant, folder, log, expand(best, searched(settings, world_model)), world_model)
+        keep_controller(variant, folder, log, space.expand(best), world_model)
     return strategy, means
-
-
-def sizes(world_model: WorldModel) -> tuple[int, int]:
-    """How many numbers z and h have."""
-    return world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
-
-
-def searched(settings: Settings, world_model: WorldModel) -> np.ndarray:
-    """Which of C's parameters CMA-ES searches, those that act on what C sees: bool (parameters,)."""
-    return seen_parameters(settings.features, *sizes(world_model))
-
-
-def start_of_search(settings: Settings, world_model: WorldModel, folder: Path) -> np.ndarray:
-    """CMA-ES's first mean: those of C's parameters that act on what it sees; in a second round of the C from before.
-
-    Raises:
-        ValueError, FileNotFoundError: the file of that C is damaged, missing, or for another V and M.
-    """
-    whole = initial_parameters(*sizes(world_model), settings.initial_gas)
-    if settings.agent_episodes:
-        whole = load_start(folder / START, world_model)
-    return whole[searched(settings, world_model)]
-
-
-def load_start(path: Path, world_model: WorldModel) -> np.ndarray:
-    """The C that a second round starts from, float64 (parameters,). Raises as `start_of_search`."""
-    tensors, facts = load_tensors(path, "delete it and run the same command again, which makes it again")
-    check_partner(path, facts, **world_model.identities)
-    parameters = tensors["parameters"].numpy()
-    check_parameters(parameters, parameter_count(*sizes(world_model)), path)
-    return parameters
-
-
-def expand(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """All of C's parameters (..., parameters) from those that are searched (..., searched); the others are zero."""
-    whole = np.zeros((*parameters.shape[:-1], len(seen)))
-    whole[..., seen] = parameters
-    return whole
 
 
 def averaged_mean(means: list[np.ndarray], settings: Settings) -> np.ndarray:
@@ -246,6 +213,17 @@ def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStr
     return cma.CMAEvolutionStrategy(start, settings.sigma, options)
 
 
+def ask(strategy: "cma.CMAEvolutionStrategy", settings: Settings, generation: int) -> np.ndarray:
+    """The population of a generation, float64 (agents, searched).
+
+    CMA-ES finds out by itself how far to step, but in hundreds of dimensions that takes it dozens of generations; with
+    `settings.sigma_decay` the step size follows a plan instead.
+    """
+    if settings.sigma_decay:
+        strategy.sigma = settings.sigma * settings.sigma_decay**generation
+    return np.array(strategy.ask())
+
+
 @threadpool_limits.wrap(limits=1)
 def replay(
     start: np.ndarray, settings: Settings, generations: list[dict]
@@ -257,7 +235,7 @@ def replay(
     """
     strategy, means = make_strategy(start, settings), []
     for number, entry in enumerate(generations):
-        population = strategy.ask()
+        population = ask(strategy, settings, number)
         strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
         means.append(strategy.mean.copy())
         if mean_checksum(strategy.mean) != entry["mean_checksum"]:

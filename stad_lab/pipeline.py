@@ -7,6 +7,7 @@ The folder of a run::
     mdn_rnn.safetensors           M
     evolution.json                every generation of CMA-ES
     controller.safetensors        C: the CMA mean that drove the validation tracks best
+    components.safetensors        where C is searched, with `Settings.components`
     start.safetensors             only in a second round: the earlier run's C, for the new V and M
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
                                   stage, and the most memory that a process has held by its end (in MB, for each start)
@@ -27,10 +28,11 @@ import torch
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoencoder
 from stad_lab.checkpoints import load_json, load_tensors, locked, save_json, save_tensors
-from stad_lab.evolution import LOG, START, evolve
+from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory, worker_processes
 from stad_lab.rollouts import COLLECT_FIELDS, collect_rollouts
+from stad_lab.search_space import COMPONENTS, START, find_components
 from stad_lab.second_round import carry_over, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import training_device
@@ -38,7 +40,7 @@ from stad_lab.training import training_device
 STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
-WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, "controller.safetensors")
+WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, COMPONENTS, "controller.safetensors")
 EARLIER = "give the folder of a first run, as `python -m stad_lab train --out` makes it"
 
 
@@ -85,12 +87,15 @@ def train(
         "rollouts": lambda pool: collect_rollouts(settings, rollouts_folder, pool),
         "autoencoder": lambda _: train_autoencoder(variant, settings, rollouts_folder, folder),
         "mdn_rnn": lambda _: train_mdn_rnn(variant, settings, rollouts_folder, folder),
-        "controller": lambda pool: evolve(variant, settings, folder, pool),
+        "controller": lambda pool: (
+            find_components(variant, settings, rollouts_folder, folder) | evolve(variant, settings, folder, pool)
+        ),
     }
     if earlier is not None:
         again = (variant, settings, Path(earlier), rollouts_folder)
         stages["rollouts"] = lambda pool: collect_again(*again, pool)
-        stages["controller"] = lambda pool: carry_over(*again, folder) | evolve(variant, settings, folder, pool)
+        search = stages["controller"]
+        stages["controller"] = lambda pool: carry_over(*again, folder) | search(pool)
     with locked(folder):
         record = open_record(folder, variant, settings, earlier)
         return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder, executor)

@@ -73,14 +73,14 @@ def make_rows() -> dict[str, Row]:
     for variant in VARIANTS:
         rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
     # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
-    first = Settings.preset("laptop", generations=15, **MANY)
-    second = Settings.preset("laptop", agent_episodes=110, generations=40, sigma=0.05, **MANY)
+    first = Settings.preset("laptop", generations=15, **OURS)
+    second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
-    few = [dataclasses.replace(settings, **FEW) for settings in (second, first)]
-    rows["two_rounds_few_agents"] = Row("input", "our recipe, but 16 agents on 4 tracks each", *few, seeds=(0,))
+    before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]
+    rows["two_rounds_few_agents"] = Row("input", "our recipe before it was improved", *before, seeds=(0,))
     # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
-    one = Settings.preset("laptop", generations=55, **MANY)
+    one = Settings.preset("laptop", generations=55, **OURS)
     rows["one_round"] = Row("input", "one round", one)
     for name, (about, changes, shares) in ABLATIONS.items():
         settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
@@ -88,15 +88,19 @@ def make_rows() -> dict[str, Row]:
     return rows
 
 
-# Two ways to spend 64 episodes on a generation. With the first one, on validation tracks, our recipe learned faster.
-MANY, FEW = {"population": 64, "tracks": 1}, {"population": 16, "tracks": 4}
+# What we do otherwise than the presets, each with its own row among the ablations.
+OURS = {"population": 64, "tracks": 1, "components": 48, "sigma_decay": 0.97, "crop_bar": False}
+BEFORE = {"population": 16, "tracks": 4, "components": 0, "sigma_decay": 0.0, "crop_bar": True}
 # Name -> what it is, the change of the "one_round" recipe, and whether V is the same.
 ABLATIONS = {
     "no_M": ("one round, C sees z alone", {"features": "z"}, True),
     "no_z": ("one round, C sees h alone", {"features": "h"}, True),
     "untrained_M": ("one round, M's weights are random", {"m_steps": 0}, True),
-    "few_agents": ("one round, 16 agents on 4 tracks each", FEW, True),
+    "few_agents": ("one round, 16 agents on 4 tracks each", {"population": 16, "tracks": 4}, True),
     "last_mean": ("one round, the last CMA mean alone", {"averaged_share": 0.0}, True),
+    "every_weight": ("one round, every weight of C searched", {"components": 0}, True),
+    "own_sigma": ("one round, CMA-ES's own step size", {"sigma_decay": 0.0}, True),
+    "no_bar": ("one round, the indicator bar cut off", {"crop_bar": True}, False),
     **{f"stride_{k}": (f"one round, stride {k}", {"stride": k}, False) for k in (1, 2, 8)},
     **{f"latent_{n}": (f"one round, {n} latents", {"latent_size": n}, False) for n in (16, 64)},
 }

@@ -17,12 +17,11 @@ from stad_lab.agent import Agent, WorldModel, load_controller, read_world_model
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum, save_tensors
 from stad_lab.controller import ACTION_SIZE
-from stad_lab.drives import remember_drive
-from stad_lab.evolution import CONTROLLER, START, hand_out, load_start, make_agent
+from stad_lab.evolution import CONTROLLER, hand_out, make_agent
 from stad_lab.frames import to_frame
-from stad_lab.mdn_rnn import encode_frames
 from stad_lab.parallel import work_alone, worker_processes
 from stad_lab.rollouts import AGENT_FIELDS, COLLECT_FIELDS, Rollouts, collect, drive_randomly, track_seeds
+from stad_lab.search_space import START, features, load_start
 from stad_lab.settings import Settings
 
 NOISE = 0.1  # of a frame's steering and gas; it wanders like the random driver's hand, so that many moments differ
@@ -131,12 +130,6 @@ def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder:
     start = fit_controller(np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT))
     save_tensors(path, {"parameters": torch.from_numpy(start)}, part="start", variant=variant, **new.identities)
     return True
-
-
-def features(world_model: WorldModel, frames: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """What C sees in an episode: z and the h before it, float32 (T, latent_size + hidden_size)."""
-    latents = encode_frames(world_model.autoencoder, frames, world_model.stride)[0]
-    return np.concatenate([latents, remember_drive(world_model.mdn_rnn, latents, actions)[0]], axis=1)
 
 
 def outputs(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:

@@ -84,6 +84,10 @@ class Settings:
     """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
     sigma: float = 0.1
     """CMA-ES's first step size."""
+    sigma_decay: float = 0.0
+    """What the step size is multiplied with in every generation; 0 leaves it to CMA-ES."""
+    components: int = 0
+    """Search along so many principal components of what C sees; 0 for along every weight of its own."""
     evolution_seed: int = 0
     """Seed of the mutations and of the tracks that are evolved on: several searches may share one V and M."""
     features: str = "z, h"
@@ -158,9 +162,10 @@ NO_LESS_THAN_ZERO = (
     "difference_weight",
     "m_steps",
     "agent_episodes",
+    "components",
 )
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
-SHARES = ("random_starts", "averaged_share")
+SHARES = ("random_starts", "averaged_share", "sigma_decay")
 FEATURES = ("z, h", "z", "h")
 
 

@@ -21,13 +21,13 @@ from stad_lab.evolution import (
     kept_generation,
     read_log,
     replay,
-    start_of_search,
     validate,
 )
 from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.pipeline import MACHINE, PACKAGES, provenance
 from stad_lab.rollouts import Rollouts
+from stad_lab.search_space import search_space
 from stad_lab.settings import Settings
 
 AGAIN = 3  # recorded episodes that are driven again
@@ -128,7 +128,7 @@ def verify_log(folder: Path, variant: str, settings: Settings) -> str:
     world_model = read_world_model(folder, variant)
     log = read_log(variant, settings, folder, world_model)
     try:
-        replay(start_of_search(settings, world_model, folder), settings, log["generations"])
+        replay(search_space(settings, world_model, folder).first, settings, log["generations"])
     except ValueError as error:
         raise NotRepeated(error) from error
     return f"ok: {len(log['generations'])} generations lead to the same mean"

@@ -16,8 +16,8 @@ from threadpoolctl import threadpool_limits
 from stad_lab.__main__ import main
 from stad_lab.agent import load_controller
 from stad_lab.checkpoints import save_json
-from stad_lab.controller import initial_parameters, seen_parameters
-from stad_lab.evolution import averaged_mean, evolve, expand, fitness_curves, make_strategy, mean_checksum, replay
+from stad_lab.controller import initial_parameters
+from stad_lab.evolution import ask, averaged_mean, evolve, fitness_curves, make_strategy, mean_checksum, replay
 from stad_lab.rollouts import TRACK_RANGES
 from stad_lab.settings import Settings
 
@@ -131,13 +131,19 @@ def test_the_last_share_of_the_means_is_averaged_and_one_at_least():
     assert averaged_mean(means[:1], settings(averaged_share=0.4))[0] == 0
 
 
-@pytest.mark.parametrize(("features", "columns"), [("z", slice(4)), ("h", slice(4, 10))])
-def test_what_c_may_not_see_has_no_weight(features, columns):
-    seen = seen_parameters(features, 4, 6)
-    whole = expand(np.arange(1.0, seen.sum() + 1), seen)
-    weights = whole[:30].reshape(3, 10)
-    assert (weights[:, columns] != 0).all() and (np.delete(weights, columns, axis=1) == 0).all()
-    assert (whole[30:] != 0).all()
+def test_the_step_size_follows_its_plan_in_a_replay_too():
+    planned = settings(sigma=0.3, sigma_decay=0.9)
+    strategy, log = make_strategy(np.zeros(8), planned), []
+    for generation in range(5):
+        population = ask(strategy, planned, generation)
+        assert strategy.sigma == pytest.approx(0.3 * 0.9**generation, rel=1e-12)
+        returns = [[-float((agent**2).sum())] for agent in population]
+        strategy.tell(population, [-one[0] for one in returns])
+        log.append({"returns": returns, "mean_checksum": mean_checksum(strategy.mean)})
+    replayed, _ = replay(np.zeros(8), planned, log)
+    assert np.array_equal(ask(replayed, planned, 5), ask(strategy, planned, 5))
+    with pytest.raises(ValueError, match="another mean in generation 2"):
+        replay(np.zeros(8), settings(sigma=0.3, sigma_decay=0.8), log)
 
 
 THREADS = """

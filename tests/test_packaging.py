@@ -33,6 +33,7 @@ ROOMS = [
     "probe",
     "quality",
     "evolution",
+    "search_space",
     "second_round",
     "evaluation",
     "pipeline",

@@ -9,10 +9,10 @@ from safetensors.numpy import load_file
 
 from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.checkpoints import load_json, save_json
-from stad_lab.evolution import load_start
 from stad_lab.pipeline import ship, total_budget, train
 from stad_lab.rollouts import Rollouts, drive_randomly
-from stad_lab.second_round import collect_again, drive_noisily, features, fit_controller, order_of_episodes, outputs
+from stad_lab.search_space import features, load_start
+from stad_lab.second_round import collect_again, drive_noisily, fit_controller, order_of_episodes, outputs
 from stad_lab.settings import Settings
 from stad_lab.verify import verify
 
