@@ -76,8 +76,8 @@ def evolve(
         watch(log["generations"])
     if log["best"] and kept == log["best"]["generation"] and len(log["generations"]) >= settings.generations:
         return False
+    space = search_space(settings, world_model, folder)
     with locked(folder), threadpool_limits(1), worker_processes(settings.processes, executor) as executor:
-        space = search_space(settings, world_model, folder)
         strategy, means = resume(variant, settings, folder, log, world_model, space, kept)
         source = hand_out(executor, folder, variant)
         done = len(log["generations"])
@@ -129,10 +129,26 @@ def resume(
 ) -> tuple["cma.CMAEvolutionStrategy", list[np.ndarray]]:
     """The strategy and its means as the log left them; makes `controller.safetensors` again if it is not the best."""
     strategy, means = replay(space.first, settings, log["generations"])
+    check_space(folder, settings, space, log["generations"], means)
     if log["best"] and log["best"]["generation"] != kept:
         best = averaged_mean(means[: log["best"]["generation"]], settings)
         keep_controller(variant, folder, log, space.expand(best), world_model)
     return strategy, means
+
+
+@threadpool_limits.wrap(limits=1)
+def check_space(
+    folder: Path, settings: Settings, space: SearchSpace, generations: list[dict], means: list[np.ndarray]
+) -> None:
+    """Raise ValueError if the last validated C is not what this search space makes of the means up to it."""
+    validated = [number for number, entry in enumerate(generations, 1) if "validation" in entry][-1:]
+    for number in validated:
+        found = mean_checksum(space.expand(averaged_mean(means[:number], settings)))
+        if found != generations[number - 1]["validation"]["controller_checksum"]:
+            raise ValueError(
+                f"{folder} holds other components, or another start, than the search in {folder / LOG} had: put the"
+                " right files back, or start in a new folder"
+            )
 
 
 def averaged_mean(means: list[np.ndarray], settings: Settings) -> np.ndarray:

@@ -17,6 +17,7 @@ from stad_lab.checkpoints import checksum, load_json
 from stad_lab.evolution import (
     CONTROLLER,
     LOG,
+    check_space,
     drive_group,
     kept_generation,
     read_log,
@@ -127,8 +128,10 @@ def verify_log(folder: Path, variant: str, settings: Settings) -> str:
         return f"none: {NOT_HERE}"
     world_model = read_world_model(folder, variant)
     log = read_log(variant, settings, folder, world_model)
+    space = search_space(settings, world_model, folder)
     try:
-        replay(search_space(settings, world_model, folder).first, settings, log["generations"])
+        _, means = replay(space.first, settings, log["generations"])
+        check_space(folder, settings, space, log["generations"], means)
     except ValueError as error:
         raise NotRepeated(error) from error
     return f"ok: {len(log['generations'])} generations lead to the same mean"

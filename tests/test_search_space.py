@@ -1,5 +1,6 @@
 """Where C is searched: along every weight that it may have, or along the principal components of what it sees."""
 
+import dataclasses
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -9,9 +10,9 @@ import pytest
 from stad_lab.agent import load_controller, read_world_model
 from stad_lab.checkpoints import load_json
 from stad_lab.controller import control, seen_columns
-from stad_lab.evolution import averaged_mean, replay
+from stad_lab.evolution import averaged_mean, evolve, replay
 from stad_lab.pipeline import ship, train
-from stad_lab.rollouts import Rollouts
+from stad_lab.rollouts import Rollouts, collect_rollouts
 from stad_lab.search_space import features, find_components, principal_components, search_space
 from stad_lab.settings import Settings
 from stad_lab.verify import verify
@@ -97,6 +98,20 @@ def test_components_are_found_once_and_belong_to_their_v_and_m(searched, quick_r
         search_space(SETTINGS, read_world_model(other, VARIANT), other)
     assert find_components(VARIANT, SETTINGS, quick_run / "rollouts", other)
     assert (other / "components.safetensors").read_bytes() == (searched / "components.safetensors").read_bytes()
+
+
+def test_a_search_does_not_go_on_along_other_components(searched, quick_run, tmp_path):
+    folder, other = (shutil.copytree(searched, tmp_path / name) for name in ("run", "other"))
+    (other / "components.safetensors").unlink()
+    fewer = Settings.preset("quick", episodes=4)  # the components of other rollouts, for the same V and M
+    collect_rollouts(fewer, tmp_path / "rollouts")
+    assert find_components(VARIANT, SETTINGS, tmp_path / "rollouts", other)
+    shutil.copy(other / "components.safetensors", folder)
+    before = (folder / "evolution.json").read_bytes()
+    with pytest.raises(ValueError, match="holds other components, or another start"):
+        evolve(VARIANT, dataclasses.replace(SETTINGS, generations=6), folder)
+    assert (folder / "evolution.json").read_bytes() == before
+    assert verify(folder)["log of CMA-ES"].startswith("FAILED")
 
 
 def test_a_run_along_components_is_verified_shipped_and_verified_again(searched, tmp_path):
