@@ -37,7 +37,7 @@ from stad_lab.rollouts import RandomDriver, collect_rollouts
 from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent / "records" / "table"
-KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every seed, as far as it has them
+KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every run, as far as it has them
 FLOORS = {  # rows of drivers that do not look at the road
     "random_driver": "smooth random steering and gas, as for the rollouts",
     "gentle_driver": "straight on with little gas, as the first agent that evolution tries",
@@ -196,17 +196,27 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
 
 
 def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
-    """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders."""
+    """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
+
+    With them go those of the first round, if the row has one.
+    """
     kept = []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:
         source = Path(folder) / name / f"seed{seed}"
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
-            kept[-1].mkdir(parents=True, exist_ok=True)
-            for file in KEPT:
-                if (source / file).exists():
-                    shutil.copyfile(source / file, kept[-1] / file)
+            copy_records(source, kept[-1])
+    if kept and (Path(folder) / name / "first").exists():
+        copy_records(Path(folder) / name / "first", target / name / "first")
     return kept
+
+
+def copy_records(source: Path, target: Path) -> None:
+    """Copy a run's records, as far as it has them."""
+    target.mkdir(parents=True, exist_ok=True)
+    for file in KEPT:
+        if (source / file).exists():
+            shutil.copyfile(source / file, target / file)
 
 
 def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:

@@ -118,7 +118,10 @@ def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     assert [path.name for path in kept] == ["seed0", "seed1"] and summarise(kept) == summaries["two"]
     assert keep("one", folder, tmp_path) == []
     sizes = [path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(sizes) == 8 and max(sizes) < 200_000  # neither V nor M
+    assert len(sizes) == 2 * 4 + 3 and max(sizes) < 200_000  # neither V nor M; a first round is not evaluated
+    assert (tmp_path / "two" / "first" / "evolution.json").read_bytes() == (
+        folder / "two" / "first" / "evolution.json"
+    ).read_bytes()
 
 
 def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long(monkeypatch):
