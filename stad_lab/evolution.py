@@ -141,14 +141,15 @@ def check_space(
     folder: Path, settings: Settings, space: SearchSpace, generations: list[dict], means: list[np.ndarray]
 ) -> None:
     """Raise ValueError if the last validated C is not what this search space makes of the means up to it."""
-    validated = [number for number, entry in enumerate(generations, 1) if "validation" in entry][-1:]
-    for number in validated:
-        found = mean_checksum(space.expand(averaged_mean(means[:number], settings)))
-        if found != generations[number - 1]["validation"]["controller_checksum"]:
-            raise ValueError(
-                f"{folder} holds other components, or another start, than the search in {folder / LOG} had: put the"
-                " right files back, or start in a new folder"
-            )
+    last = max((number for number, entry in enumerate(generations, 1) if "validation" in entry), default=0)
+    if not last:
+        return
+    found = mean_checksum(space.expand(averaged_mean(means[:last], settings)))
+    if found != generations[last - 1]["validation"]["controller_checksum"]:
+        raise ValueError(
+            f"{folder} holds other components, or another start, than the search in {folder / LOG} had: put the"
+            " right files back, or start in a new folder"
+        )
 
 
 def averaged_mean(means: list[np.ndarray], settings: Settings) -> np.ndarray:

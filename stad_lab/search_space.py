@@ -44,6 +44,11 @@ class SearchSpace:
         return self.origin + found @ self.directions
 
 
+def sizes(world_model: WorldModel) -> tuple[int, int]:
+    """How many numbers z and h have."""
+    return world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
+
+
 def search_space(settings: Settings, world_model: WorldModel, folder: Path) -> SearchSpace:
     """Where the search of a run goes on, and from where: from nothing, or in a second round from the C of before.
 
@@ -51,14 +56,15 @@ def search_space(settings: Settings, world_model: WorldModel, folder: Path) -> S
         ValueError, FileNotFoundError: the file of that C or of the components is damaged, missing, or for another V
             and M.
     """
-    sizes = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
-    start = initial_parameters(*sizes, settings.initial_gas)
+    start = initial_parameters(*sizes(world_model), settings.initial_gas)
     if settings.agent_episodes:
         start = load_start(folder / START, world_model)
     if settings.components:
         directions = load_directions(folder / COMPONENTS, world_model)
         return SearchSpace(np.zeros(len(directions)), start, directions)
-    seen = np.concatenate([np.tile(seen_columns(settings.features, *sizes), ACTION_SIZE), np.ones(ACTION_SIZE, bool)])
+    seen = np.concatenate(
+        [np.tile(seen_columns(settings.features, *sizes(world_model)), ACTION_SIZE), np.ones(ACTION_SIZE, bool)]
+    )
     return SearchSpace(start[seen], np.zeros(len(start)), np.eye(len(start))[seen])
 
 
@@ -67,8 +73,7 @@ def load_start(path: Path, world_model: WorldModel) -> np.ndarray:
     tensors, facts = load_tensors(path, MAKE_AGAIN)
     check_partner(path, facts, **world_model.identities)
     parameters = tensors["parameters"].numpy()
-    sizes = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
-    check_parameters(parameters, parameter_count(*sizes), path)
+    check_parameters(parameters, parameter_count(*sizes(world_model)), path)
     return parameters
 
 
@@ -91,8 +96,9 @@ def find_components(variant: str, settings: Settings, rollouts_folder: Path, fol
     rollouts = Rollouts(rollouts_folder)
     drives = zip(tqdm(rollouts.frames, "components", unit="episode"), rollouts.actions, strict=True)
     seen = (features(world_model, frames, actions) for frames, actions in drives)
-    sizes = world_model.autoencoder.latent_size, world_model.mdn_rnn.hidden_size
-    middle, components = principal_components(seen, seen_columns(settings.features, *sizes), settings.components)
+    middle, components = principal_components(
+        seen, seen_columns(settings.features, *sizes(world_model)), settings.components
+    )
     tensors = {"middle": torch.from_numpy(middle), "components": torch.from_numpy(components)}
     save_tensors(path, tensors, part="components", variant=variant, **world_model.identities)
     return True
