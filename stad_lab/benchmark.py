@@ -464,7 +464,8 @@ def measure_cluster(rounds: int) -> dict:
 
     from stad_lab.cluster import cluster
 
-    settings, agent = Settings.preset("laptop", max_frames=100, patience=0), load_agent(VARIANT)
+    settings = Settings.preset("laptop", population=16, tracks=4, max_frames=100, patience=0)
+    agent = load_agent(VARIANT)
     agents = np.repeat(agent.parameters[None], settings.population * settings.tracks, axis=0)
     address = {"threads_per_worker": 1, "dashboard_address": None}
     with (

@@ -15,6 +15,7 @@ import dataclasses
 import shutil
 import tempfile
 import time
+from collections import Counter
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,14 +74,14 @@ def make_rows() -> dict[str, Row]:
     for variant in VARIANTS:
         rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
     # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
-    first = Settings.preset("laptop", generations=15, **OURS)
+    first = Settings.preset("laptop", generations=15, crop_bar=False)
     second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
     before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]
     rows["two_rounds_few_agents"] = Row("input", "our recipe before it was improved", *before, seeds=(0,))
     # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
-    one = Settings.preset("laptop", generations=55, **OURS)
+    one = Settings.preset("laptop", crop_bar=False)
     rows["one_round"] = Row("input", "one round", one)
     for name, (about, changes, shares) in ABLATIONS.items():
         settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
@@ -88,8 +89,7 @@ def make_rows() -> dict[str, Row]:
     return rows
 
 
-# What we do otherwise than the presets, each with its own row among the ablations.
-OURS = {"population": 64, "tracks": 1, "components": 48, "sigma_decay": 0.97, "crop_bar": False}
+# Our recipe before it was improved.
 BEFORE = {"population": 16, "tracks": 4, "components": 0, "sigma_decay": 0.0, "crop_bar": True}
 # Name -> what it is, the change of the "one_round" recipe, and whether V is the same.
 ABLATIONS = {
@@ -100,7 +100,7 @@ ABLATIONS = {
     "last_mean": ("one round, the last CMA mean alone", {"averaged_share": 0.0}, True),
     "every_weight": ("one round, every weight of C searched", {"components": 0}, True),
     "own_sigma": ("one round, CMA-ES's own step size", {"sigma_decay": 0.0}, True),
-    "no_bar": ("one round, the indicator bar cut off", {"crop_bar": True}, False),
+    "no_bar": ("one round, the indicator bar cut off: the laptop settings", {"crop_bar": True}, False),
     **{f"stride_{k}": (f"one round, stride {k}", {"stride": k}, False) for k in (1, 2, 8)},
     **{f"latent_{n}": (f"one round, {n} latents", {"latent_size": n}, False) for n in (16, 64)},
 }
@@ -198,7 +198,7 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
 def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
-    With them go those of the first round, if the row has one.
+    With them go those of the first round and of the world, if the row has its own.
     """
     kept = []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:
@@ -206,8 +206,9 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
-    if kept and (Path(folder) / name / "first").exists():
-        copy_records(Path(folder) / name / "first", target / name / "first")
+    for part in ("first", "world"):
+        if kept and (Path(folder) / name / part).exists():
+            copy_records(Path(folder) / name / part, target / name / part)
     return kept
 
 
@@ -223,6 +224,21 @@ def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
     """The rows that have been made: name -> folders of its seeds, in the order of FLOORS and ROWS."""
     found = {name: sorted((records / name).glob("seed*")) for name in [*FLOORS, *ROWS]}
     return {name: folders for name, folders in found.items() if folders}
+
+
+def stage_times(row: Path) -> dict[str, float]:
+    """How long the stages of a row took, from nothing to the evaluated agent of seed 0, in seconds.
+
+    Args:
+        row: folder of a row that has a world of its own. The stages of a first round count too.
+
+    Returns:
+        "rollouts", "autoencoder", "mdn_rnn", "controller" and "evaluation" -> seconds.
+    """
+    times: Counter[str] = Counter()
+    for part in ("first", "world", "seed0") if (row / "first").exists() else ("world", "seed0"):
+        times.update(load_json(row / part / "record.json")["seconds"])
+    return dict(times) | {"evaluation": load_json(row / "seed0" / "evaluation.json")["seconds"]}
 
 
 def lost_points(folders: list[Path]) -> dict[str, float]:

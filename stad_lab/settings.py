@@ -76,17 +76,17 @@ class Settings:
     """Adam's rate at the start; it falls to a tenth along a cosine."""
 
     # C, evolved by CMA-ES
-    generations: int = 100
+    generations: int = 55
     """Generations of CMA-ES."""
-    population: int = 16
+    population: int = 64
     """Agents in a generation."""
-    tracks: int = 4
+    tracks: int = 1
     """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
     sigma: float = 0.1
     """CMA-ES's first step size."""
-    sigma_decay: float = 0.0
+    sigma_decay: float = 0.97
     """What the step size is multiplied with in every generation; 0 leaves it to CMA-ES."""
-    components: int = 0
+    components: int = 48
     """Search along so many principal components of what C sees; 0 for along every weight of its own."""
     evolution_seed: int = 0
     """Seed of the mutations and of the tracks that are evolved on: several searches may share one V and M."""
@@ -221,7 +221,8 @@ PRESETS = {
         m_sequence=24,
         generations=4,
         population=4,
-        tracks=1,
+        sigma_decay=0.0,
+        components=0,
         max_frames=60,
         cars=4,
         validate_every=2,
@@ -247,7 +248,8 @@ PRESETS = {
         m_learning_rate=1e-3,
         generations=600,
         population=8,
-        tracks=1,
+        sigma_decay=0.0,
+        components=0,
         initial_gas=0.0,
         patience=0,
         validate_every=20,

@@ -27,6 +27,7 @@ from stad_lab.replication import (
     learning_curve,
     lost_points,
     replicate,
+    stage_times,
     summarise,
 )
 from stad_lab.settings import Settings
@@ -118,10 +119,21 @@ def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     assert [path.name for path in kept] == ["seed0", "seed1"] and summarise(kept) == summaries["two"]
     assert keep("one", folder, tmp_path) == []
     sizes = [path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(sizes) == 2 * 4 + 3 and max(sizes) < 200_000  # neither V nor M; a first round is not evaluated
+    assert len(sizes) == 2 * 4 + 3 + 1 and max(sizes) < 200_000  # neither V nor M; a first round is not evaluated
     assert (tmp_path / "two" / "first" / "evolution.json").read_bytes() == (
         folder / "two" / "first" / "evolution.json"
     ).read_bytes()
+
+
+def test_the_times_of_a_row_are_those_of_all_its_stages_in_both_rounds(table, tmp_path):
+    folder = table[0] / "two"
+    times = stage_times(folder)
+    assert list(times) == ["rollouts", "autoencoder", "mdn_rnn", "controller", "evaluation"]
+    for stage in ("rollouts", "autoencoder", "mdn_rnn"):
+        spent = [load_json(folder / part / "record.json")["seconds"][stage] for part in ("first", "world")]
+        assert times[stage] == sum(spent) > max(spent)
+    keep("two", table[0], tmp_path)
+    assert stage_times(tmp_path / "two") == times
 
 
 def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long(monkeypatch):
