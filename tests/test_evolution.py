@@ -178,8 +178,8 @@ def test_a_replay_comes_to_the_logged_means_with_any_number_of_threads():
     start, log = initial_parameters(32, 256), []
     with threadpool_limits(1):
         strategy = make_strategy(start, Settings.preset("laptop"))
-        for _ in range(14):
-            population = np.array(strategy.ask())
+        for generation in range(14):
+            population = ask(strategy, Settings.preset("laptop"), generation)
             returns = [[-float((agent**2).sum())] for agent in population]
             strategy.tell(population, [-np.mean(one) for one in returns])
             log.append({"returns": returns, "mean_checksum": mean_checksum(strategy.mean)})
