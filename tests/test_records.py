@@ -4,7 +4,8 @@ import json
 import re
 from pathlib import Path
 
-from stad_lab.replication import ROWS, kept_rows, summarise
+from stad_lab.replication import ROWS, kept_rows, stage_times, summarise
+from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
 README = (Path(__file__).parent.parent / "README.md").read_text()
@@ -68,3 +69,21 @@ def test_the_readme_s_rows_are_the_replication_s():
         counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}"]
         scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
         assert cells(f"`{name}`") == [seeds, *scores, *counts]
+
+
+def test_the_readme_s_times_are_those_of_whole_runs_and_keep_the_promise():
+    assert ROWS["no_bar"].settings == Settings.preset("laptop") and ROWS["paper_input"].settings == Settings.preset(
+        "paper"
+    )
+    times = [stage_times(RECORDS / "table" / name) for name in ("no_bar", "paper_input")]
+    labels = {
+        "rollouts": "random episodes",
+        "autoencoder": "training V",
+        "mdn_rnn": "training M",
+        "controller": "the search for C",
+    }
+    for stage, label in (labels | {"evaluation": "100 official tracks"}).items():
+        assert cells(label) == [f"{one[stage] / 60:.1f}" for one in times]
+    whole = [sum(one.values()) / 60 for one in times]
+    assert cells("all, minutes") == [f"{minutes:.1f}" for minutes in whole]
+    assert whole[0] <= 30 and whole[1] <= 120  # what is promised on two cores
