@@ -228,7 +228,7 @@ PRESETS = {
         validate_every=2,
         validation_tracks=2,
     ),
-    # A car that drives, in less than half an hour on two cores.
+    # A car that drives, in less than half an hour on two fast cores.
     "laptop": Settings(),
     # The budget that the paper states, with World Models' sizes and loss, and its passes over the data: one for V,
     # twenty for M. What the paper leaves open is our reading: one episode for each agent, for example.

@@ -72,10 +72,9 @@ def test_the_readme_s_rows_are_the_replication_s():
 
 
 def test_the_readme_s_times_are_those_of_whole_runs_and_keep_the_promise():
-    assert ROWS["no_bar"].settings == Settings.preset("laptop") and ROWS["paper_input"].settings == Settings.preset(
-        "paper"
-    )
-    times = [stage_times(RECORDS / "table" / name) for name in ("no_bar", "paper_input")]
+    runs = {"no_bar": "laptop", "paper_input": "paper"}
+    assert all(ROWS[name].settings == Settings.preset(preset) for name, preset in runs.items())
+    times = [stage_times(RECORDS / "table" / name) for name in runs]
     labels = {
         "rollouts": "random episodes",
         "autoencoder": "training V",
