@@ -73,15 +73,15 @@ def make_rows() -> dict[str, Row]:
     rows = {}
     for variant in VARIANTS:
         rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
+    # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
+    one = Settings.preset("laptop", crop_bar=False)
     # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
-    first = Settings.preset("laptop", generations=15, crop_bar=False)
+    first = dataclasses.replace(one, generations=15)
     second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
     before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]
     rows["two_rounds_few_agents"] = Row("input", "our recipe before it was improved", *before, seeds=(0,))
-    # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
-    one = Settings.preset("laptop", crop_bar=False)
     rows["one_round"] = Row("input", "one round", one)
     for name, (about, changes, shares) in ABLATIONS.items():
         settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
