@@ -5,6 +5,7 @@ can tell apart; difference images lie on one diverging map centred at zero.
 """
 
 import io
+import itertools
 from collections.abc import Iterable
 
 import numpy as np
@@ -17,6 +18,7 @@ from stad_lab.drives import Drive, Inside
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
+STYLES = tuple((color, dash) for dash in ("-", "--", "-.", ":") for color in COLORS)  # where there may be many lines
 MARKERS = "os^DvP"  # beside the colours: to colour-blind eyes GREEN and PURPLE are two greys
 DIFFERENCE_MAP = "PuOr_r"
 
@@ -424,10 +426,10 @@ def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figu
     """
     figure, axes = new_figure(11.0, 3.9, 1, 3, sharey=True)
     for panel, (axis, name) in enumerate(zip(axes[0], ("worst", "average", "best"), strict=True)):
-        for (label, curves), color in zip(runs.items(), COLORS, strict=False):
+        for (label, curves), (color, dash) in zip(runs.items(), itertools.cycle(STYLES), strict=False):
             smooth = np.apply_along_axis(np.convolve, 1, curves[:, panel], np.full(window, 1 / window), "valid")
             generation = np.arange(smooth.shape[1]) + (window + 1) / 2
-            axis.plot(generation, smooth.mean(axis=0), color=color, lw=1.6, label=label)
+            axis.plot(generation, smooth.mean(axis=0), dash, color=color, lw=1.6, label=label)
             axis.fill_between(generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.2, lw=0)
         axis.axhline(900, color="grey", lw=0.8, ls=":")
         axis.set_title(f"{name} agent of a generation", fontsize=10)
@@ -450,9 +452,9 @@ def plot_episodes(
         published: name -> episodes -> score, as others have reported: points without a line.
     """
     figure, ((axis,),) = new_figure(8.0, 4.4)
-    for (name, seeds), color in zip(runs.items(), COLORS, strict=False):
+    for (name, seeds), (color, dash) in zip(runs.items(), itertools.cycle(STYLES), strict=False):
         for number, (episodes, scores) in enumerate(seeds):
-            axis.plot(episodes, scores, color=color, lw=1.3, alpha=0.8, label=name if number == 0 else None)
+            axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8, label=name if number == 0 else None)
     for (name, points), marker in zip(published.items(), MARKERS, strict=False):
         axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
     axis.axhline(900, color="grey", lw=0.8, ls=":")

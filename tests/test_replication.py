@@ -102,6 +102,14 @@ def test_a_learning_curve_ends_at_all_the_episodes_of_its_seed(table):
     assert figure.get_label() == f"Score. At the end, mean of the seeds: two {np.mean([c[1][-1] for c in curves]):.0f}."
 
 
+def test_no_row_is_left_out_of_a_figure_however_many_there_are():
+    rows = [f"row {number}" for number in range(25)]
+    fair = plot_episodes({name: [(np.array([1, 2]), np.array([3, 4]))] for name in rows}, {}, "Score")
+    seeds = plot_seeds({name: np.zeros((1, 3, 6)) for name in rows}, "Evolution")
+    for axis in (fair.axes[0], seeds.axes[0]):
+        assert axis.get_legend_handles_labels()[1] == rows
+
+
 def test_a_band_goes_from_the_lowest_to_the_highest_seed(table):
     logs = [load_json(table[0] / "two" / f"seed{seed}" / "evolution.json") for seed in (0, 1)]
     curves = np.stack([fitness_curves(log["generations"]) for log in logs])
