@@ -16,12 +16,12 @@ import torch
 from stad_lab.agent import Agent, WorldModel, load_controller, read_world_model
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum, save_tensors
-from stad_lab.controller import ACTION_SIZE
+from stad_lab.controller import ACTION_SIZE, seen_columns
 from stad_lab.evolution import CONTROLLER, hand_out, make_agent
 from stad_lab.frames import to_frame
 from stad_lab.parallel import work_alone, worker_processes
 from stad_lab.rollouts import AGENT_FIELDS, COLLECT_FIELDS, Rollouts, collect, drive_randomly, track_seeds
-from stad_lab.search_space import START, features, load_start
+from stad_lab.search_space import START, features, load_start, sizes
 from stad_lab.settings import Settings
 
 NOISE = 0.1  # of a frame's steering and gas; it wanders like the random driver's hand, so that many moments differ
@@ -127,7 +127,8 @@ def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder:
             frames, actions = rollouts.frames[block], rollouts.actions[block]
             wanted.append(outputs(parameters, features(old, frames, actions)))
             seen.append(features(new, frames, actions))
-    start = fit_controller(np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT))
+    columns = seen_columns(settings.features, *sizes(new))
+    start = fit_controller(np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT), columns)
     save_tensors(path, {"parameters": torch.from_numpy(start)}, part="start", variant=variant, **new.identities)
     return True
 
@@ -138,15 +139,18 @@ def outputs(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return seen @ weights.T + bias
 
 
-def fit_controller(seen: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def fit_controller(seen: np.ndarray, wanted: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """The C that comes nearest to the wanted outputs (T, 3) from what it sees (T, features): float64 (parameters,).
+
+    Only the features in `columns`, bool (features,), have weights; the others' are 0.
 
     Ridge regression: W and b make the mean squared error of W s + b, plus the penalty times the sum of all squared
     weights, the smallest. Small weights matter more here than the last percent of the fit, since evolution changes all
     weights by equal steps.
     """
     middle, target = seen.mean(axis=0, dtype=np.float64), wanted.mean(axis=0)
-    centred = seen - middle
-    square = centred.T @ centred + PENALTY * len(seen) * np.eye(seen.shape[1])
-    weights = np.linalg.solve(square, centred.T @ (wanted - target)).T
+    centred = (seen - middle)[:, columns]
+    square = centred.T @ centred + PENALTY * len(seen) * np.eye(columns.sum())
+    weights = np.zeros((ACTION_SIZE, len(columns)))
+    weights[:, columns] = np.linalg.solve(square, centred.T @ (wanted - target)).T
     return np.concatenate([weights.ravel(), target - weights @ middle])

@@ -1,5 +1,6 @@
 """A second round: both drivers' episodes, C carried over to another V and M, and one budget for all of it."""
 
+import dataclasses
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -12,7 +13,7 @@ from stad_lab.checkpoints import load_json, save_json
 from stad_lab.pipeline import ship, total_budget, train
 from stad_lab.rollouts import Rollouts, drive_randomly
 from stad_lab.search_space import features, load_start
-from stad_lab.second_round import collect_again, drive_noisily, fit_controller, order_of_episodes, outputs
+from stad_lab.second_round import carry_over, collect_again, drive_noisily, fit_controller, order_of_episodes, outputs
 from stad_lab.settings import Settings
 from stad_lab.verify import verify
 
@@ -81,7 +82,29 @@ def test_evolution_starts_from_what_the_earlier_agent_knew(second, quick_run):
 def test_a_controller_is_found_again_from_its_own_outputs():
     rng = np.random.default_rng(0)
     parameters, seen = rng.standard_normal(3 * 20 + 3), 30 * rng.standard_normal((500, 20))
-    assert fit_controller(seen, outputs(parameters, seen)) == pytest.approx(parameters, abs=1e-2)
+    everything = np.ones(20, bool)
+    assert fit_controller(seen, outputs(parameters, seen), everything) == pytest.approx(parameters, abs=1e-2)
+
+
+def test_a_controller_that_may_not_see_a_feature_has_no_weight_for_it():
+    rng = np.random.default_rng(0)
+    seen, wanted, columns = rng.standard_normal((500, 20)), rng.standard_normal((500, 3)), np.arange(20) < 8
+    found = fit_controller(seen, wanted, columns)
+    alone = fit_controller(seen[:, columns], wanted, np.ones(8, bool))
+    assert np.array_equal(found[:-3].reshape(3, 20)[:, ~columns], np.zeros((3, 12)))
+    assert outputs(found, seen) == pytest.approx(outputs(alone, seen[:, columns]))
+
+
+def test_a_second_round_on_z_alone_starts_without_weights_for_h(second, quick_run, tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for part in ("autoencoder", "mdn_rnn"):
+        shutil.copy(second / f"{part}.safetensors", folder)
+    settings = dataclasses.replace(SETTINGS, features="z")
+    carry_over(VARIANT, settings, quick_run, second / "rollouts", folder)
+    start = load_file(folder / "start.safetensors")["parameters"]
+    weights = start[:-3].reshape(3, -1)
+    assert not weights[:, SETTINGS.latent_size :].any() and weights[:, : SETTINGS.latent_size].all()
 
 
 def test_both_rounds_are_in_the_budget(second, quick_run):
