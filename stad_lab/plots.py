@@ -70,7 +70,7 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
         change: stride -> mean `|d|` at the end of every ride.
     """
     figure, ((axis,),) = new_figure(6.5, 3.6)
-    for (stride, values), color in zip(change.items(), COLORS, strict=False):
+    for (stride, values), color in zip(change.items(), itertools.cycle(COLORS), strict=False):
         correlation = np.corrcoef(speed, values)[0, 1]
         axis.scatter(
             speed, values, s=8, color=color, alpha=0.6, label=f"stride {stride}: correlation {correlation:.2f}"
@@ -103,7 +103,7 @@ def plot_history(history: list[dict], title: str, unit: str) -> Figure:
 def plot_bars(values: dict[str, np.ndarray], title: str, xlabel: str, ylabel: str) -> Figure:
     """Sorted values, one panel for each name, on one scale: for example the KL of every latent dimension."""
     figure, axes = new_figure(2.1 * len(values) + 0.6, 2.7, 1, len(values), sharey=True)
-    for (name, array), axis, color in zip(values.items(), axes[0], COLORS, strict=False):
+    for (name, array), axis, color in zip(values.items(), axes[0], itertools.cycle(COLORS), strict=False):
         axis.bar(np.arange(len(array)), np.sort(array)[::-1], color=color, width=0.9)
         axis.set_title(name, fontsize=9)
         axis.set_xlabel(xlabel, fontsize=9)
@@ -120,7 +120,7 @@ def plot_mixture(
     figure, ((axis,),) = new_figure(6.5, 3.4)
     reach = 4 * np.exp(logsigma) * np.sqrt(max(temperatures))
     z = np.linspace((mean - reach).min(), (mean + reach).max(), 600)
-    for temperature, color in zip(temperatures, COLORS, strict=False):
+    for temperature, color in zip(temperatures, itertools.cycle(COLORS), strict=False):
         weights = np.exp((logpi - logpi.max()) / temperature)
         weights /= weights.sum()
         sigma = np.exp(logsigma) * np.sqrt(temperature)
@@ -156,8 +156,8 @@ def plot_curves(
     """
     many = len(curves) > 4  # then the names stand beside the lines
     figure, ((axis,),) = new_figure(7.5 if many else 6.5, 3.2)
-    shapes = MARKERS if many and marker else [marker] * len(curves)
-    for (name, values), color, shape in zip(curves.items(), COLORS, shapes, strict=False):
+    shapes = itertools.cycle(MARKERS if many and marker else [marker])
+    for (name, values), color, shape in zip(curves.items(), itertools.cycle(COLORS), shapes, strict=False):
         places = np.arange(1, len(values) + 1) if x is None else x
         axis.plot(places, values, color=color, label=name, marker=shape)
     axis.set(xlabel=xlabel, ylabel=ylabel, **axis_settings)
@@ -190,7 +190,7 @@ def plot_intervals(
     shifts = np.linspace(-0.2, 0.2, len(names)) if len(names) > 1 else [0]
     for axis, (panel, contenders) in zip(axes.flat, panels.items(), strict=False):
         for place, row in enumerate(rows):
-            for name, color, shift in zip(names, COLORS, shifts, strict=False):
+            for name, color, shift in zip(names, itertools.cycle(COLORS), shifts, strict=False):
                 if name not in contenders[row]:
                     continue
                 value, interval = contenders[row][name]
@@ -203,7 +203,9 @@ def plot_intervals(
     for axis in axes[-1]:
         axis.set_xlabel(xlabel, fontsize=9)
     if len(names) > 1:
-        handles = [axes[0, 0].plot([], [], "o", color=c)[0] for _, c in zip(names, COLORS, strict=False)]
+        handles = [
+            axes[0, 0].plot([], [], "o", color=c)[0] for _, c in zip(names, itertools.cycle(COLORS), strict=False)
+        ]
         figure.legend(handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
     figure.set_label(f"{title}. Panels: {', '.join(filter(None, panels)) or 'one'}; rows: {', '.join(rows)}.")
@@ -249,7 +251,7 @@ def plot_rate_distortion(rates: np.ndarray, errors: np.ndarray, names: list[str]
 def plot_shares(shares: dict[str, np.ndarray], title: str, xlabel: str) -> Figure:
     """Histograms of numbers in [0, 1] as outlines, each bar as a multiple of what a uniform one would have."""
     figure, ((axis,),) = new_figure(6.5, 3.2)
-    for (name, share), color in zip(shares.items(), COLORS, strict=False):
+    for (name, share), color in zip(shares.items(), itertools.cycle(COLORS), strict=False):
         axis.stairs(share * len(share), np.linspace(0, 1, len(share) + 1), color=color, lw=1.8, label=name)
     axis.axhline(1, color="black", lw=1, ls="--", label="uniform")
     axis.set(xlabel=xlabel, ylabel="density", ylim=(0, None))
@@ -277,7 +279,9 @@ def plot_map(points: np.ndarray, colors: dict[str, np.ndarray], title: str) -> F
 def plot_fit(x: np.ndarray, y: np.ndarray, samples: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
     """Data points, and beside them what models would draw in their place: name -> (x, y)."""
     figure, axes = new_figure(2.5 * (1 + len(samples)) + 0.3, 2.9, 1, 1 + len(samples), sharex=True, sharey=True)
-    for axis, (name, dots), color in zip(axes[0], {"data": (x, y), **samples}.items(), COLORS, strict=False):
+    for axis, (name, dots), color in zip(
+        axes[0], {"data": (x, y), **samples}.items(), itertools.cycle(COLORS), strict=False
+    ):
         axis.scatter(*dots, s=3, alpha=0.4, color=color)
         axis.set_title(name, fontsize=9)
         axis.set_xlabel("input")
@@ -470,7 +474,7 @@ def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
     """Every episode's return as a dot, one row for each name, with the mean as a bar."""
     figure, ((axis,),) = new_figure(7.0, 0.8 * len(returns) + 1.4)
     rng = np.random.default_rng(0)
-    for row, (values, color) in enumerate(zip(returns.values(), COLORS, strict=False)):
+    for row, (values, color) in enumerate(zip(returns.values(), itertools.cycle(COLORS), strict=False)):
         axis.scatter(values, row + rng.uniform(-0.22, 0.22, len(values)), s=12, color=color, alpha=0.6)
         axis.plot([values.mean()] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
         axis.text(1.01, row, f"mean {values.mean():.0f}", transform=axis.get_yaxis_transform(), va="center", fontsize=9)

@@ -13,7 +13,7 @@ from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import fitness_curves
 from stad_lab.pipeline import total_budget
-from stad_lab.plots import plot_episodes, plot_seeds, plot_stacks
+from stad_lab.plots import plot_curves, plot_episodes, plot_returns, plot_seeds, plot_stacks
 from stad_lab.replication import (
     FLOORS,
     ROWS,
@@ -106,8 +106,11 @@ def test_no_row_is_left_out_of_a_figure_however_many_there_are():
     rows = [f"row {number}" for number in range(25)]
     fair = plot_episodes({name: [(np.array([1, 2]), np.array([3, 4]))] for name in rows}, {}, "Score")
     seeds = plot_seeds({name: np.zeros((1, 3, 6)) for name in rows}, "Evolution")
-    for axis in (fair.axes[0], seeds.axes[0]):
+    lines = plot_curves({name: np.arange(3) for name in rows}, "Lines", "x", "y", marker="o")
+    for axis in (fair.axes[0], seeds.axes[0], lines.axes[0]):
         assert axis.get_legend_handles_labels()[1] == rows
+    returns = plot_returns({name: np.arange(3) for name in rows}, "Returns")
+    assert len(returns.axes[0].collections) == len(rows)
 
 
 def test_a_band_goes_from_the_lowest_to_the_highest_seed(table):
