@@ -169,8 +169,11 @@ load_world_model = functools.lru_cache(maxsize=2)(read_world_model)  # so that a
 
 
 def run_folder(variant: str, path: str | Path | None = None) -> Path:
-    """The folder of a run: `path`, or that of the agent that comes with stad_lab."""
-    return PRETRAINED / variant if path is None else Path(path)
+    """The folder of a run: `path`, or that of the agent that comes with stad_lab, of a second round if of no first."""
+    if path is not None:
+        return Path(path)
+    folders = [PRETRAINED / variant, PRETRAINED / "second_round" / variant]
+    return next((folder for folder in folders if (folder / "controller.safetensors").exists()), folders[0])
 
 
 def load_agent(variant: str, path: str | Path | None = None) -> Agent:
@@ -187,7 +190,7 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
     check_variant(variant)
     folder = run_folder(variant, path)
     if path is None and not (folder / "controller.safetensors").exists():
-        shipped = ", ".join(sorted(file.parent.name for file in PRETRAINED.glob("*/controller.safetensors")))
+        shipped = ", ".join(sorted({file.parent.name for file in PRETRAINED.rglob("controller.safetensors")}))
         raise FileNotFoundError(
             f"no trained {variant!r} agent comes with stad_lab, only {shipped or 'none at all'}: train one with"
             f" `python -m stad_lab train --variant {variant} --out runs/{variant}` and give path='runs/{variant}'"

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from tqdm.auto import tqdm
 
-from stad_lab.agent import WorldModel, load_agent, load_world_model, run_folder
+from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, kl_divergence, load_autoencoder
 from stad_lab.drives import (
     MOTION,
@@ -134,7 +134,7 @@ def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: li
     for driver, (driven, skip) in drivers.items():
         found = result["variants"][driver] = {}
         for variant in VARIANTS:
-            autoencoder, mdn_rnn, stride, crop_bar, _ = load_world_model(run_folder(variant), variant)
+            autoencoder, mdn_rnn, stride, crop_bar, _ = load_world_model(PRETRAINED / variant, variant)
             memories = {"z, h": mdn_rnn, "z, h of an untrained M": untrained_mdn_rnn}
             found[variant] = probe_drives(driven, skip, autoencoder, memories, stride, crop_bar)
         for name, autoencoder in untrained.items():
@@ -208,7 +208,7 @@ def autoencoder_part(settings: Settings, rollouts_folder: Path, work: Path, driv
 
     variants = {}
     for variant in VARIANTS:
-        autoencoder, facts = load_autoencoder(run_folder(variant) / "autoencoder.safetensors", variant)
+        autoencoder, facts = load_autoencoder(PRETRAINED / variant / "autoencoder.safetensors", variant)
         variants[variant] = measure(autoencoder, facts["stride"], facts["crop_bar"])
     rate_distortion = {}
     for weight in KL_WEIGHTS:
@@ -223,7 +223,7 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
     actions = np.array([drive.actions for drive in whole])
     result = {"whole_drives": len(whole), "horizon_steps": HORIZON, "variants": {}}
     for variant in VARIANTS:
-        world_model = load_world_model(run_folder(variant), variant)
+        world_model = load_world_model(PRETRAINED / variant, variant)
         autoencoder, mdn_rnn, stride, crop_bar, _ = world_model
         mu, logvar = (
             np.array(part)

@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 import torch
 
 from stad_lab import Agent, load_agent, make_env
-from stad_lab.agent import drive, load_controller, save_controller
+from stad_lab.agent import drive, load_controller, run_folder, save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder
 from stad_lab.controller import parameter_count
 from stad_lab.mdn_rnn import MDNRNN
@@ -237,6 +238,18 @@ def test_a_variant_that_is_not_shipped_is_an_error_that_names_the_command(monkey
     monkeypatch.setattr("stad_lab.agent.PRETRAINED", tmp_path)
     with pytest.raises(FileNotFoundError, match="no trained 'frame' agent comes with stad_lab, only input: train one"):
         load_agent("frame")
+
+
+def test_without_an_agent_of_a_first_round_that_of_a_second_one_is_taken(monkeypatch, tmp_path):
+    for folder in ("input", "second_round/input", "second_round/frame"):
+        (tmp_path / folder).mkdir(parents=True)
+        (tmp_path / folder / "controller.safetensors").touch()
+    (tmp_path / "frame").mkdir()  # V and M alone
+    monkeypatch.setattr("stad_lab.agent.PRETRAINED", tmp_path)
+    assert run_folder("input") == tmp_path / "input"
+    assert run_folder("frame") == tmp_path / "second_round" / "frame"
+    assert run_folder("output") == tmp_path / "output"
+    assert run_folder("input", "runs/mine") == Path("runs/mine")
 
 
 @pytest.mark.parametrize("part", ["autoencoder", "mdn_rnn", "controller"])

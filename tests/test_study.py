@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stad_lab.__main__ import main
-from stad_lab.agent import read_world_model, run_folder
+from stad_lab.agent import PRETRAINED, read_world_model
 from stad_lab.autoencoder import VARIANTS, AutoEncoder
 from stad_lab.checkpoints import load_json
 from stad_lab.drives import MOTION, record_random_drive
@@ -50,7 +50,7 @@ def test_the_command_measures_m_against_simple_forecasts_and_lesser_m_s(measured
 
 
 def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_run):
-    world_model = read_world_model(run_folder("input"), "input")
+    world_model = read_world_model(PRETRAINED / "input", "input")
     rng = np.random.default_rng(0)
     z, actions = rng.standard_normal((4, 20, 32), np.float32), rng.random((4, 20, 3), np.float32)
     arguments = (Settings.preset("quick"), quick_run / "rollouts", measured, world_model, z, actions)
