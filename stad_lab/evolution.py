@@ -40,6 +40,7 @@ if TYPE_CHECKING:
 
 LOG = "evolution.json"
 CONTROLLER = "controller.safetensors"
+REMEMBERED, RESTING = 20, 4  # generations from which a hard track may be driven again, and the last ones, which rest
 
 
 def evolve(
@@ -82,8 +83,8 @@ def evolve(
         source = hand_out(executor, folder, variant)
         done = len(log["generations"])
         progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
-        for generation in progress:
-            entry = run_generation(generation, strategy, means, space, executor, source, variant, settings)
+        for _ in progress:
+            entry = run_generation(log["generations"], strategy, means, space, executor, source, variant, settings)
             log["generations"].append(entry)
             better = note_best(log)
             save_json(folder / LOG, log)
@@ -97,7 +98,7 @@ def evolve(
 
 
 def run_generation(
-    generation: int,
+    earlier: list[dict],
     strategy: "cma.CMAEvolutionStrategy",
     means: list[np.ndarray],
     space: SearchSpace,
@@ -107,12 +108,12 @@ def run_generation(
     settings: Settings,
 ) -> dict:
     """Ask for a population, let it drive, and tell its fitness; adds to the means, returns the log's entry."""
-    population = ask(strategy, settings, generation)
-    entry = drive_generation(executor, source, variant, settings, generation, space.expand(population))
+    population = ask(strategy, settings, len(earlier))
+    entry = drive_generation(executor, source, variant, settings, earlier, space.expand(population))
     strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
     means.append(strategy.mean.copy())
     entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
-    if (generation + 1) % settings.validate_every == 0:
+    if entry["generation"] % settings.validate_every == 0:
         controller = space.expand(averaged_mean(means, settings))
         entry["validation"] = validate(executor, source, variant, settings, controller)
     return entry
@@ -278,16 +279,39 @@ def hand_out(executor: Executor, folder: Path, variant: str) -> Any:
     return share(read_world_model(folder, variant)) if share else Path(folder)
 
 
+def generation_tracks(settings: Settings, earlier: list[dict]) -> list[int]:
+    """The tracks of the generation after the `earlier` ones: new ones, or in some generations hard ones again.
+
+    Ranks say who was better, not by how much. On an easy track the fastest agents win, and that they lose hundreds of
+    points elsewhere counts in no rank. So a share `revisited_share` of the generations goes back to the track on which
+    the average agent did worst when it was last driven, among those of the last REMEMBERED generations, without the
+    last RESTING ones (a simple form of prioritised level replay: Jiang, Grefenstette and Rocktaschel, 2021).
+    """
+    number, share = len(earlier), settings.revisited_share
+    new = track_seeds("evolve", settings.tracks, settings.seed, number, settings.evolution_seed)
+    if int((number + 1) * share) == int(number * share):
+        return new
+    last_average = {}
+    for entry in earlier[-REMEMBERED:]:
+        last_average |= dict(zip(entry["tracks"], np.mean(entry["returns"], axis=0), strict=True))
+    resting = {track for entry in earlier[-RESTING:] for track in entry["tracks"]}
+    hard = sorted(last_average.keys() - resting, key=last_average.get)
+    return (hard + new)[: settings.tracks]
+
+
 def drive_generation(
-    executor: Executor, source: Any, variant: str, settings: Settings, generation: int, population: np.ndarray
+    executor: Executor, source: Any, variant: str, settings: Settings, earlier: list[dict], population: np.ndarray
 ) -> dict:
-    """Let every agent drive the generation's tracks; returns the log's entry with "returns" [agent][track]."""
-    tracks = track_seeds("evolve", settings.tracks, settings.seed, generation, settings.evolution_seed)
+    """Let every agent drive the tracks of the generation after the `earlier` ones: the log's entry.
+
+    Its "returns" are [agent][track].
+    """
+    tracks = generation_tracks(settings, earlier)
     agents = np.repeat(population, len(tracks), axis=0)
     returns, lengths = drive_parallel(executor, source, variant, agents, tracks * len(population), settings)
     shape = (len(population), len(tracks))
     return {
-        "generation": generation + 1,
+        "generation": len(earlier) + 1,
         "tracks": tracks,
         "returns": returns.reshape(shape).tolist(),
         "frames": int(lengths.sum()),

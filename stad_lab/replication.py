@@ -77,9 +77,11 @@ def make_rows() -> dict[str, Row]:
     one = Settings.preset("laptop", crop_bar=False)
     # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
     first = dataclasses.replace(one, generations=15)
-    second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05)
+    second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
+    never_back = dataclasses.replace(second, revisited_share=0.0)
+    rows["two_rounds_new_tracks"] = Row("input", "our recipe, new tracks alone", never_back, first, seeds=(0,))
     before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]
     rows["two_rounds_few_agents"] = Row("input", "our recipe before it was improved", *before, seeds=(0,))
     rows["one_round"] = Row("input", "one round", one)
@@ -90,7 +92,14 @@ def make_rows() -> dict[str, Row]:
 
 
 # Our recipe before it was improved.
-BEFORE = {"population": 16, "tracks": 4, "components": 0, "sigma_decay": 0.0, "crop_bar": True}
+BEFORE = {
+    "population": 16,
+    "tracks": 4,
+    "revisited_share": 0.0,
+    "components": 0,
+    "sigma_decay": 0.0,
+    "crop_bar": True,
+}
 # Name -> what it is, the change of the "one_round" recipe, and whether V is the same.
 ABLATIONS = {
     "no_M": ("one round, C sees z alone", {"features": "z"}, True),
@@ -340,7 +349,7 @@ def speeds(row: Row, folder: Path) -> dict[str, float]:
     with worker_processes(settings.processes) as executor:
         for _ in range(2):  # the first time workers start
             begin = time.perf_counter()
-            entry = drive_generation(executor, folder, row.variant, brief, 0, np.tile(start, (settings.population, 1)))
+            entry = drive_generation(executor, folder, row.variant, brief, [], np.tile(start, (settings.population, 1)))
             driven = entry["frames"] / (time.perf_counter() - begin)
     env = make_env(fast=False)
     env.reset(seed=0)

@@ -82,6 +82,8 @@ class Settings:
     """Agents in a generation."""
     tracks: int = 1
     """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
+    revisited_share: float = 0.0
+    """Share of the generations that drive hard tracks of before again, instead of new ones."""
     sigma: float = 0.1
     """CMA-ES's first step size."""
     sigma_decay: float = 0.97
@@ -165,7 +167,7 @@ NO_LESS_THAN_ZERO = (
     "components",
 )
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
-SHARES = ("random_starts", "averaged_share", "sigma_decay")
+SHARES = ("random_starts", "revisited_share", "averaged_share", "sigma_decay")
 FEATURES = ("z, h", "z", "h")
 
 

@@ -17,7 +17,16 @@ from stad_lab.__main__ import main
 from stad_lab.agent import load_controller
 from stad_lab.checkpoints import save_json
 from stad_lab.controller import initial_parameters
-from stad_lab.evolution import ask, averaged_mean, evolve, fitness_curves, make_strategy, mean_checksum, replay
+from stad_lab.evolution import (
+    ask,
+    averaged_mean,
+    evolve,
+    fitness_curves,
+    generation_tracks,
+    make_strategy,
+    mean_checksum,
+    replay,
+)
 from stad_lab.rollouts import TRACK_RANGES
 from stad_lab.settings import Settings
 
@@ -122,6 +131,42 @@ def test_the_controller_is_the_averaged_mean_that_drove_the_validation_tracks_be
     _, means = replay(start, settings(), log["generations"][: log["best"]["generation"]])
     best = averaged_mean(means, settings())
     assert np.array_equal(load_controller(one_go / "controller.safetensors", "input_output")[0], best)
+
+
+def test_half_of_the_generations_go_back_to_the_hardest_track_that_has_rested():
+    back, log = settings(revisited_share=0.5), []
+    difficulty = {}
+    for number in range(60):
+        tracks = generation_tracks(back, log)
+        new = generation_tracks(settings(), log)
+        rested = {entry["tracks"][0] for entry in log[-20:]} - {entry["tracks"][0] for entry in log[-4:]}
+        if number % 2 and rested:
+            assert tracks == [min(rested, key=difficulty.get)]  # what it was when it was last driven
+        else:
+            assert tracks == new and new[0] not in difficulty
+        difficulty[tracks[0]] = float((7 * number) % 23)  # of all agents together: some are better, some worse
+        log.append({"tracks": tracks, "returns": [[difficulty[tracks[0]] - 5.0], [difficulty[tracks[0]] + 5.0]]})
+    assert len(difficulty) == 32  # the first two of thirty goes back found nothing to go back to
+
+
+def test_a_generation_of_several_tracks_goes_back_to_the_hardest_of_them():
+    back = settings(revisited_share=0.5, tracks=3)
+    log = [{"tracks": [10, 11, 12, 13], "returns": [[4.0, 1.0, 3.0, 2.0], [4.0, 1.0, 3.0, 2.0]]}]
+    log += [{"tracks": [number], "returns": [[0.0]]} for number in range(4)]
+    assert generation_tracks(back, log) == [11, 13, 12]
+    few = [log[0] | {"tracks": [10], "returns": [[4.0]]}, *log[1:]]
+    assert generation_tracks(back, few) == [10, *generation_tracks(settings(tracks=2), few)]
+
+
+def test_going_back_to_hard_tracks_survives_an_interruption(quick_run, tmp_path):
+    stopped, straight = (without_evolution(quick_run, tmp_path / name) for name in ("stopped", "straight"))
+    back = {"revisited_share": 0.5, "processes": 1}
+    evolve("input_output", settings(generations=6, **back), stopped)
+    for folder in (stopped, straight):
+        evolve("input_output", settings(generations=8, **back), folder)
+    assert read(stopped)["generations"] == read(straight)["generations"]
+    tracks = [entry["tracks"][0] for entry in read(straight)["generations"]]
+    assert tracks[5] == tracks[0] and tracks[7] in tracks[:3]
 
 
 def test_the_last_share_of_the_means_is_averaged_and_one_at_least():
