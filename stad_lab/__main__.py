@@ -112,6 +112,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     command.add_argument("--row", required=True, help=f"one of {', '.join([*ROWS, *FLOORS])}")
     command.add_argument("--out", required=True, type=Path, help="folder of all rows, for example runs/table")
+    command.add_argument("--seeds", type=int, nargs="+", help="of the searches for C; all of the row's without it")
     command.add_argument(
         "--keep", action="store_true", help="only copy the records of the finished seeds to stad_lab/records/table"
     )
@@ -223,8 +224,8 @@ def main(arguments: list[str] | None = None) -> int:
         elif options.command == "replicate" and options.keep:
             print("\n".join(f"kept in {folder}" for folder in keep(options.row, options.out)) or "no seed is finished")
         elif options.command == "replicate":
-            print(describe_forecast(options.row, forecast(options.row)), flush=True)
-            print(describe_row(options.row, replicate(options.row, options.out)))
+            print(describe_forecast(options.row, forecast(options.row, options.seeds)), flush=True)
+            print(describe_row(options.row, replicate(options.row, options.out, seeds=options.seeds)))
         elif options.command == "study":
             settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
             file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)

@@ -16,6 +16,7 @@ import shutil
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,35 +117,42 @@ ABLATIONS = {
 ROWS = make_rows()
 
 
-def replicate(name: str, folder: str | Path, executor: Executor | None = None) -> dict:
+def replicate(
+    name: str, folder: str | Path, executor: Executor | None = None, seeds: Sequence[int] | None = None
+) -> dict:
     """Make one row of the table, or what is missing of it; run it again after an interrupt to go on.
 
     Args:
         name: one of ROWS or FLOORS.
         folder: of all rows; this one goes into `folder/name`.
         executor: who drives; None for processes of this machine.
+        seeds: some of the row's seeds; None for all. A floor has none.
 
     Returns:
-        What `summarise` makes of the row.
+        What `summarise` makes of these seeds.
 
     Raises:
-        ValueError: an unknown row, or a folder with something else in it.
+        ValueError: an unknown row or seed, or a folder with something else in it.
         OSError, TaskError, FloatingPointError: as `train` and `evaluate`.
     """
     if name in FLOORS:
         return drive_floor(name, Path(folder) / name / "seed0", executor)
-    row, folder = find_row(name), Path(folder)
+    row, folder = find_row(name, seeds), Path(folder)
     first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
     for seed in row.seeds:
         search(row, seed, folder / name / f"seed{seed}", first, world, executor)
     return summarise([folder / name / f"seed{seed}" for seed in row.seeds])
 
 
-def find_row(name: str) -> Row:
-    """The row of a name. Raises ValueError if there is none."""
+def find_row(name: str, seeds: Sequence[int] | None = None) -> Row:
+    """The row of a name, if wanted with some of its seeds alone. Raises ValueError if there is no such row or seed."""
     if name not in ROWS:
         raise ValueError(f"unknown row {name!r}: choose one of {', '.join([*ROWS, *FLOORS])}")
-    return ROWS[name]
+    row = ROWS[name]
+    for seed in seeds or ():
+        if seed not in row.seeds:
+            raise ValueError(f"row {name!r} has no seed {seed}: choose of {', '.join(map(str, row.seeds))}")
+    return dataclasses.replace(row, seeds=tuple(seeds)) if seeds else row
 
 
 def drive_floor(name: str, folder: Path, executor: Executor | None) -> dict:
@@ -309,14 +317,16 @@ def bootstrap(returns: np.ndarray) -> list[float]:
     return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
 
 
-def forecast(name: str) -> dict[str, float]:
-    """How long a row takes on this machine, in seconds: what it is for -> time. Measures for about half a minute.
+def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
+    """How long a row, or some of its seeds, takes on this machine, in seconds: what it is for -> time.
+
+    Measures for about half a minute.
 
     An agent's episode is taken to have as many frames as it may have at most, so the searches may be quicker.
     """
     if name in FLOORS:
         return {"evaluations": TRACKS * 1000 / (Settings().processes * blind_speed(name))}
-    row = find_row(name)
+    row = find_row(name, seeds)
     with tempfile.TemporaryDirectory() as folder:
         speed = speeds(row, Path(folder))
     rounds = [row.first, row.settings] if row.first else [row.settings]

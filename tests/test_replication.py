@@ -188,6 +188,22 @@ def test_an_unknown_row_ends_in_one_line_that_names_the_rows(capsys, tmp_path):
     assert "error: unknown row 'papers': choose one of paper_frame, paper_input" in capsys.readouterr().err
 
 
+def test_an_unknown_seed_ends_in_one_line_that_names_the_seeds(capsys, tmp_path):
+    assert main(["replicate", "--row", "one_round", "--out", str(tmp_path), "--seeds", "1", "7"]) == 2
+    assert "error: row 'one_round' has no seed 7: choose of 0, 1, 2" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+def test_some_seeds_of_a_row_can_be_made_alone(table, monkeypatch):
+    folder, summaries = table
+    assert replicate("two", folder, seeds=[1])["seeds"] == summaries["two"]["seeds"][1:]
+    speeds = {"V, M, C": 10.0, "V": 10.0, "M": 10.0, "official": 10.0}
+    monkeypatch.setattr(replication, "speeds", lambda *_: speeds)  # measured twice they would differ
+    whole, one = forecast("one_round"), forecast("one_round", seeds=[2])
+    for part, share in {"rollouts": 1, "V": 1, "M": 1, "searches": 3, "evaluations": 3}.items():
+        assert whole[part] == pytest.approx(share * one[part])
+
+
 def test_the_command_keeps_what_is_finished(tmp_path, capsys):
     assert main(["replicate", "--row", "one_round", "--out", str(tmp_path), "--keep"]) == 0
     assert "no seed is finished" in capsys.readouterr().out
