@@ -81,6 +81,8 @@ def make_rows() -> dict[str, Row]:
     second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
+    longer = dataclasses.replace(second, generations=160, sigma_decay=0.99)
+    rows["long_input"] = Row("input", "our recipe, four times as long", longer, first, (0,), "two_rounds_input")
     never_back = dataclasses.replace(second, revisited_share=0.0)
     rows["two_rounds_new_tracks"] = Row("input", "our recipe, new tracks alone", never_back, first, seeds=(0,))
     before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]

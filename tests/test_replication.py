@@ -163,7 +163,8 @@ def test_every_row_has_the_budget_that_the_table_promises():
         looks = sum(settings.generations // settings.validate_every * settings.validation_tracks for settings in rounds)
         driven = sum(settings.generations * settings.population * settings.tracks for settings in rounds)
         episodes = row.settings.episodes + row.settings.agent_episodes + driven + looks
-        assert agents <= 4800 and (name.startswith("paper") or episodes <= 4800), (name, agents, episodes)
+        if name != "long_input":  # which asks what more would bring
+            assert agents <= 4800 and (name.startswith("paper") or episodes <= 4800), (name, agents, episodes)
     assert {row.variant for name, row in ROWS.items() if name.startswith("two_rounds") and len(row.seeds) >= 3} == {
         "frame",
         "input",
