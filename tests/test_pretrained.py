@@ -42,8 +42,9 @@ def test_v_and_m_of_every_variant_are_shipped_with_their_record(variant):
     assert record["made_with"]["commit"] and not record["made_with"]["uncommitted_changes"]
 
 
-def test_the_agent_of_the_variant_input_is_shipped():
-    assert "input" in AGENTS
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_an_agent_of_every_variant_is_shipped_and_loads_by_its_name(variant):
+    assert load_agent(variant).autoencoder.variant == variant
 
 
 @pytest.mark.parametrize("agent", AGENTS)
