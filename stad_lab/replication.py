@@ -295,8 +295,7 @@ def summarise(folders: list[Path]) -> dict:
         (the mean of each), "above_900" (share of episodes), "top_90" (mean of each seed's best 90 episodes), and the
         budget of one seed: "agents", "episodes", "frames" (means over the seeds), with all that was driven before it.
     """
-    evaluations = [load_json(folder / "evaluation.json", "evaluate again") for folder in folders]
-    returns = np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
+    returns = official_returns(folders)
     budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
     return {
         **summarise_episodes(returns.ravel()),
@@ -305,6 +304,12 @@ def summarise(folders: list[Path]) -> dict:
         "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
         **{unit: float(np.mean([spent[unit] for spent in budgets])) for unit in ("agents", "episodes", "frames")},
     }
+
+
+def official_returns(folders: list[Path]) -> np.ndarray:
+    """The returns of a row's seeds on the official tracks, float64 (seeds, tracks), from their folders."""
+    evaluations = [load_json(folder / "evaluation.json", "evaluate again") for folder in folders]
+    return np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
 
 
 def bootstrap(returns: np.ndarray) -> list[float]:
