@@ -106,6 +106,7 @@ def build_parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser(
         "replicate",
+        parents=[scheduler],
         help="make a row of the replication's table",
         description="Make one row of the table: V and M, a search for C for every seed, 100 official tracks for each C"
         " found. It says first how long it will take; stop it when you like, the same command goes on.",
@@ -224,8 +225,9 @@ def main(arguments: list[str] | None = None) -> int:
         elif options.command == "replicate" and options.keep:
             print("\n".join(f"kept in {folder}" for folder in keep(options.row, options.out)) or "no seed is finished")
         elif options.command == "replicate":
-            print(describe_forecast(options.row, forecast(options.row, options.seeds)), flush=True)
-            print(describe_row(options.row, replicate(options.row, options.out, seeds=options.seeds)))
+            with drivers(options.scheduler) as executor:
+                print(describe_forecast(options.row, forecast(options.row, options.seeds)), flush=True)
+                print(describe_row(options.row, replicate(options.row, options.out, executor, options.seeds)))
         elif options.command == "study":
             settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
             file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)

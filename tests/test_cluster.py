@@ -13,6 +13,7 @@ import pytest
 from distributed import Client
 from test_faults import VARIANT, assert_equal_results, start_of
 
+from stad_lab import replication
 from stad_lab.__main__ import main
 from stad_lab.checkpoints import load_json
 from stad_lab.cluster import check_versions, cluster, versions
@@ -110,6 +111,16 @@ def test_the_command_line_evolves_on_a_cluster(scheduler, quick_run, tmp_path, c
     command = ["train", "--variant", VARIANT, "--settings", "quick", "--scheduler", scheduler[0], "--out", str(folder)]
     assert main(command) == 0
     assert_equal_results(folder, quick_run, "controller")
+
+
+def test_the_command_line_makes_a_row_of_the_table_on_a_cluster(scheduler, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(replication, "TRACKS", 3)
+    row, episodes = ["replicate", "--row", "gentle_driver", "--out"], []
+    for folder, where in (("far", ["--scheduler", scheduler[0]]), ("near", [])):
+        assert main([*row, str(tmp_path / folder), *where]) == 0
+        episodes.append(load_json(tmp_path / folder / "gentle_driver" / "seed0" / "evaluation.json")["episodes"])
+    assert len(episodes[0]) == 3 and episodes[0] == episodes[1]
+    assert "gentle_driver: at most" in capsys.readouterr().out
 
 
 def test_a_worker_killed_in_mid_generation_costs_a_retry_and_not_the_run(scheduler, quick_run, tmp_path):
