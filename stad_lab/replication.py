@@ -217,7 +217,8 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
 def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
-    With them go those of the first round and of the world, if the row has its own.
+    With seed 0 go those of the first round and of the world, if the row has its own. Seeds that are made elsewhere, in
+    a folder of their own, have V and M from another training by the same settings; which, their logs say.
     """
     kept = []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:
@@ -226,7 +227,7 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
     for part in ("first", "world"):
-        if kept and (Path(folder) / name / part).exists():
+        if any(path.name == "seed0" for path in kept) and (Path(folder) / name / part).exists():
             copy_records(Path(folder) / name / part, target / name / part)
     return kept
 

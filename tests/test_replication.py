@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -134,6 +135,18 @@ def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     assert (tmp_path / "two" / "first" / "evolution.json").read_bytes() == (
         folder / "two" / "first" / "evolution.json"
     ).read_bytes()
+
+
+def test_a_seed_that_was_made_elsewhere_joins_the_row_and_leaves_the_world_of_seed_0(table, tmp_path):
+    folder, summaries = table
+    for place, other in (("here", "seed1"), ("elsewhere", "seed0")):
+        shutil.copytree(folder / "two", tmp_path / place / "two", ignore=shutil.ignore_patterns(other, "rollouts"))
+    save_json(tmp_path / "elsewhere" / "two" / "world" / "record.json", {"variant": "of another training"})
+    kept = tmp_path / "kept"
+    for place, seed in (("here", "seed0"), ("elsewhere", "seed1")):
+        assert [path.name for path in keep("two", tmp_path / place, kept)] == [seed]
+    assert summarise(kept_rows(kept)["two"]) == summaries["two"]
+    assert load_json(kept / "two" / "world" / "record.json") == load_json(folder / "two" / "world" / "record.json")
 
 
 def test_the_times_of_a_row_are_those_of_all_its_stages_in_both_rounds(table, tmp_path):
