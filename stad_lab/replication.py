@@ -36,6 +36,7 @@ from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
 from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.pipeline import provenance, total_budget, train
 from stad_lab.rollouts import RandomDriver, collect_rollouts
+from stad_lab.search_space import COMPONENTS, START
 from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent / "records" / "table"
@@ -203,11 +204,17 @@ def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path 
 
 
 def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, executor: Executor | None) -> None:
-    """Search for C with one seed, drive what was found on the official tracks, and write `evaluation.json`."""
+    """Search for C with one seed, drive what was found on the official tracks, and write `evaluation.json`.
+
+    Where a search begins, and along which components, depends on the world alone: the first seed finds it for all.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    for part in ("autoencoder", "mdn_rnn") if row.settings.m_steps else ("autoencoder",):
-        if not (folder / f"{part}.safetensors").exists():
-            shutil.copy(world / f"{part}.safetensors", folder)
+    trained = ("autoencoder", "mdn_rnn") if row.settings.m_steps else ("autoencoder",)
+    made = [world / f"{part}.safetensors" for part in trained]
+    made += [path for part in (COMPONENTS, START) for path in folder.parent.glob(f"seed*/{part}")]
+    for source in made:
+        if not (folder / source.name).exists():
+            shutil.copy(source, folder)
     settings = dataclasses.replace(row.settings, evolution_seed=seed)
     worked = train(row.variant, settings, folder, world / "rollouts", executor=executor, earlier=first)
     if worked or not (folder / "evaluation.json").exists():

@@ -12,7 +12,7 @@ from stad_lab import replication
 from stad_lab.__main__ import main
 from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import evaluate
-from stad_lab.evolution import fitness_curves
+from stad_lab.evolution import LOG, fitness_curves
 from stad_lab.pipeline import total_budget
 from stad_lab.plots import plot_curves, plot_episodes, plot_returns, plot_seeds, plot_stacks
 from stad_lab.replication import (
@@ -35,7 +35,7 @@ from stad_lab.settings import Settings
 
 TINY = {"processes": 1, "generations": 2, "v_steps": 8, "m_steps": 4}
 FIRST = Settings.preset("quick", **TINY)
-SECOND = Settings.preset("quick", **TINY | {"agent_episodes": 2, "generations": 4})
+SECOND = Settings.preset("quick", **TINY | {"agent_episodes": 2, "generations": 4, "components": 8})
 
 
 @pytest.fixture(scope="module")
@@ -62,6 +62,19 @@ def test_a_row_holds_a_search_for_every_seed_on_the_same_world(table):
     assert logs[0]["autoencoder"] == logs[1]["autoencoder"]
     assert logs[0]["generations"][0]["tracks"] != logs[1]["generations"][0]["tracks"]
     assert logs[0]["generations"][0]["mean_checksum"] != logs[1]["generations"][0]["mean_checksum"]
+
+
+def test_where_the_searches_of_a_row_begin_is_found_once(table, tmp_path, capsys):
+    folder, _ = table
+    for part in ("world", "first"):
+        shutil.copytree(folder / "two" / part, tmp_path / "two" / part)
+    with ThreadPoolExecutor(1) as executor:
+        for seed in (0, 1):
+            capsys.readouterr()
+            replicate("two", tmp_path, executor, seeds=[seed])
+            assert ("components:" in capsys.readouterr().err) == (seed == 0)
+    for seed in ("seed0", "seed1"):
+        assert (tmp_path / "two" / seed / LOG).read_bytes() == (folder / "two" / seed / LOG).read_bytes()
 
 
 def test_a_row_that_shares_a_world_trains_none_of_its_own(table):
