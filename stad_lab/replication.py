@@ -234,7 +234,7 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
     for part in ("first", "world"):
-        if any(path.name == "seed0" for path in kept) and (Path(folder) / name / part).exists():
+        if target / name / "seed0" in kept and (Path(folder) / name / part).exists():
             copy_records(Path(folder) / name / part, target / name / part)
     return kept
 
