@@ -142,18 +142,18 @@ def collect_rollouts(settings: Settings, folder: Path, executor: Executor | None
     made_with = {field: getattr(settings, field) for field in COLLECT_FIELDS}
     tasks = [(settings, index) for index in range(settings.episodes)]
     with worker_processes(settings.processes, executor) as executor:
-        return collect(folder, made_with, drive_randomly, tasks, settings.episode_frames, executor)
+        return collect(folder, made_with, drive_randomly, tasks, [settings.episode_frames] * len(tasks), executor)
 
 
 def collect(
-    folder: Path, made_with: dict, drive_episode: Callable, tasks: list[tuple], frames: int, executor: Executor
+    folder: Path, made_with: dict, drive_episode: Callable, tasks: list[tuple], longest: list[int], executor: Executor
 ) -> bool:
     """Drive the episodes that are not in `folder` yet, one for each task, and write their blocks.
 
     Args:
         made_with: what the dataset depends on; it is kept in the manifest, and a folder of another one is refused.
         drive_episode: called with a task, it returns frames, actions and track as `drive_randomly`.
-        frames: of an episode, at most.
+        longest: frames that each episode has at most.
 
     Returns, and raises, as `collect_rollouts`.
     """
@@ -170,7 +170,7 @@ def collect(
     if not missing:
         return False
     with locked(folder):
-        check_disk(folder, len(missing) * frames * FRAME_BYTES)
+        check_disk(folder, sum(longest[index] for index in missing) * FRAME_BYTES)
         save_json(manifest_path, manifest)
         episodes = run_tasks(executor, drive_episode, [tasks[index] for index in missing])
         for number, episode in tqdm(episodes, "collect", len(tasks), initial=len(done), unit="episode"):

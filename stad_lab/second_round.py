@@ -51,10 +51,11 @@ def collect_again(
     parameters, _ = load_controller(earlier / CONTROLLER, variant)
     made_with = {field: getattr(settings, field) for field in (*COLLECT_FIELDS, *AGENT_FIELDS)}
     made_with |= {"variant": variant, "controller_sha256": checksum((earlier / CONTROLLER).read_bytes())}
-    longest = max(settings.episode_frames, settings.max_frames)
+    numbers = order_of_episodes(settings)
+    longest = [settings.episode_frames if number < settings.episodes else settings.max_frames for number in numbers]
     with worker_processes(settings.processes, executor) as executor:
         source = hand_out(executor, earlier, variant)
-        tasks = [(source, variant, parameters, settings, number) for number in order_of_episodes(settings)]
+        tasks = [(source, variant, parameters, settings, number) for number in numbers]
         return collect(folder, made_with, drive_either, tasks, longest, executor)
 
 

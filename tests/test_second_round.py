@@ -1,6 +1,7 @@
 """A second round: both drivers' episodes, C carried over to another V and M, and one budget for all of it."""
 
 import dataclasses
+import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -51,6 +52,15 @@ def test_a_collection_of_both_drivers_goes_on_where_it_stopped(second, quick_run
     assert collect_again(VARIANT, SETTINGS, quick_run, folder)
     assert not collect_again(VARIANT, SETTINGS, quick_run, folder)
     assert load_json(folder / "manifest.json") == manifest
+
+
+def test_a_second_round_asks_for_the_room_that_its_two_kinds_of_episodes_may_take(quick_run, tmp_path):
+    settings = dataclasses.replace(SETTINGS, max_frames=900_000_000)
+    with pytest.raises(OSError, match=r"up to \d+\.\d\d GB") as error:
+        collect_again(VARIANT, settings, quick_run, tmp_path)
+    asked = float(re.search(r"up to (\d+\.\d+) GB", str(error.value))[1])
+    frames = settings.agent_episodes * settings.max_frames + settings.episodes * settings.episode_frames
+    assert asked == pytest.approx(frames * (64 * 64 * 3 + 12) / 1e9, rel=1e-3)
 
 
 def test_an_unsteady_hand_differs_between_episodes_and_m_remembers_what_was_done(agent, quick_run):
