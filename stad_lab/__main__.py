@@ -136,7 +136,8 @@ def build_parser() -> argparse.ArgumentParser:
         "benchmark",
         help="measure speeds side by side with Gymnasium and EnvPool",
         description="Let the fast renderer, the loop and the training take turns with the usual ways to do the same"
-        " work; about eight minutes on a machine that does nothing else. EnvPool takes part if it is installed.",
+        " work, on a machine that does nothing else; without the part cluster it takes about eight minutes. EnvPool"
+        " takes part if it is installed.",
     )
     command.add_argument(
         "--part", action="append", choices=list(PARTS), help="only this part; may be repeated; default all"
@@ -175,7 +176,8 @@ def changed_settings(preset: str | None, changes: list[str]) -> Settings:
         if not equals:
             raise ValueError(f"--set {change!r}: expected NAME=VALUE, for example stride=2")
         try:
-            values[name] = text if kinds.get(name, str) is str else json.loads(text)
+            kind = kinds.get(name, str)
+            values[name] = text if kind is str else json.loads(text.lower() if kind is bool else text)
         except json.JSONDecodeError:
             hint = " (true or false)" if kinds.get(name) is bool else ""
             raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}{hint}") from None

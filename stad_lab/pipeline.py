@@ -16,6 +16,7 @@ The folder of a run::
 import importlib.metadata
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import time
@@ -160,7 +161,8 @@ def open_record(folder: Path, variant: str, settings: Settings, earlier: str | P
 def command_of(variant: str, settings: Settings) -> str:
     """The command line that makes a run of these settings again."""
     preset = Settings.preset(settings.name).as_dict()
-    changes = [f"--set {name}={value}" for name, value in settings.as_dict().items() if value != preset[name]]
+    changed = [f"{name}={value}" for name, value in settings.as_dict().items() if value != preset[name]]
+    changes = [f"--set {shlex.quote(change)}" for change in changed]
     changes += ["--earlier ..."] if settings.agent_episodes else []
     return " ".join([f"python -m stad_lab train --variant {variant} --settings {settings.name} --out ...", *changes])
 

@@ -3,6 +3,7 @@
 import dataclasses
 import importlib.metadata
 import json
+import shlex
 import shutil
 import sys
 
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from stad_lab.__main__ import main
+from stad_lab.__main__ import changed_settings, main
 from stad_lab.agent import save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, save_autoencoder
 from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
+from stad_lab.pipeline import command_of
 from stad_lab.settings import PRESETS, Settings
 
 
@@ -137,6 +139,14 @@ def test_until_stops_after_a_stage_and_set_changes_a_setting(tmp_path, capsys):
     settings = json.loads((tmp_path / "record.json").read_text())["settings"]
     changes = {"stride": 2, "episodes": 2, "crop_bar": False, "kl_weight": 0.5}
     assert Settings.from_dict(settings) == Settings.preset("quick", **changes)
+
+
+def test_the_command_in_a_record_asks_for_the_settings_of_that_record():
+    settings = Settings.preset("laptop", crop_bar=False, stride=2, sigma_decay=0.0, features="z")
+    said = shlex.split(command_of("input", settings))
+    changes = [said[place + 1] for place, word in enumerate(said) if word == "--set"]
+    assert len(changes) == 4
+    assert changed_settings(said[said.index("--settings") + 1], changes) == settings
 
 
 @pytest.mark.parametrize(("name", "options"), [("drive.gif", []), ("drive.webp", ["--viewer"])])
