@@ -280,23 +280,25 @@ def hand_out(executor: Executor, folder: Path, variant: str) -> Any:
 
 
 def generation_tracks(settings: Settings, earlier: list[dict]) -> list[int]:
-    """The tracks of the generation after the `earlier` ones: new ones, or in some generations hard ones again.
+    """The tracks of the generation after the `earlier` ones: new ones, and some hard ones again.
 
     Ranks say who was better, not by how much. On an easy track the fastest agents win, and that they lose hundreds of
-    points elsewhere counts in no rank. So a share `revisited_share` of the generations goes back to the track on which
-    the average agent did worst when it was last driven, among those of the last REMEMBERED generations, without the
-    last RESTING ones (a simple form of prioritised level replay: Jiang, Grefenstette and Rocktaschel, 2021).
+    points elsewhere counts in no rank. So a share `revisited_share` of the tracks, one by one, goes back to the one on
+    which the average agent did worst when it was last driven, among those of the last REMEMBERED generations, without
+    the last RESTING ones (a simple form of prioritised level replay: Jiang, Grefenstette and Rocktaschel, 2021). With
+    one track a generation, those with a new track and with a hard one take turns.
     """
-    number, share = len(earlier), settings.revisited_share
-    new = track_seeds("evolve", settings.tracks, settings.seed, number, settings.evolution_seed)
-    if int((number + 1) * share) == int(number * share):
+    number, count, share = len(earlier), settings.tracks, settings.revisited_share
+    new = track_seeds("evolve", count, settings.seed, number, settings.evolution_seed)
+    back = int((number + 1) * count * share) - int(number * count * share)
+    if not back:
         return new
     last_average = {}
     for entry in earlier[-REMEMBERED:]:
         last_average |= dict(zip(entry["tracks"], np.mean(entry["returns"], axis=0), strict=True))
     resting = {track for entry in earlier[-RESTING:] for track in entry["tracks"]}
     hard = sorted(last_average.keys() - resting, key=last_average.get)
-    return (hard + new)[: settings.tracks]
+    return (hard[:back] + new)[:count]
 
 
 def drive_generation(

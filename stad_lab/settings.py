@@ -83,7 +83,7 @@ class Settings:
     tracks: int = 1
     """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
     revisited_share: float = 0.0
-    """Share of the generations that drive hard tracks of before again, instead of new ones."""
+    """Share of the tracks that are hard ones of before again, instead of new ones."""
     sigma: float = 0.1
     """CMA-ES's first step size."""
     sigma_decay: float = 0.97

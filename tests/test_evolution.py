@@ -149,13 +149,26 @@ def test_half_of_the_generations_go_back_to_the_hardest_track_that_has_rested():
     assert len(difficulty) == 32  # the first two of thirty goes back found nothing to go back to
 
 
-def test_a_generation_of_several_tracks_goes_back_to_the_hardest_of_them():
-    back = settings(revisited_share=0.5, tracks=3)
+def test_a_generation_of_several_tracks_mixes_the_hardest_of_before_with_new_ones():
     log = [{"tracks": [10, 11, 12, 13], "returns": [[4.0, 1.0, 3.0, 2.0], [4.0, 1.0, 3.0, 2.0]]}]
     log += [{"tracks": [number], "returns": [[0.0]]} for number in range(4)]
-    assert generation_tracks(back, log) == [11, 13, 12]
+    new = generation_tracks(settings(tracks=4), log)
+    assert generation_tracks(settings(revisited_share=0.25, tracks=4), log) == [11, *new[:3]]
+    assert generation_tracks(settings(revisited_share=0.5, tracks=4), log) == [11, 13, *new[:2]]
+    assert generation_tracks(settings(revisited_share=1.0, tracks=4), log) == [11, 13, 12, 10]
     few = [log[0] | {"tracks": [10], "returns": [[4.0]]}, *log[1:]]
-    assert generation_tracks(back, few) == [10, *generation_tracks(settings(tracks=2), few)]
+    assert generation_tracks(settings(revisited_share=0.5, tracks=4), few) == [10, *new[:3]]
+
+
+def test_the_share_of_revisited_tracks_holds_over_the_generations_for_any_number_of_tracks():
+    for tracks, share in ((1, 0.5), (2, 0.5), (3, 0.5), (3, 0.25)):
+        log = []
+        for _ in range(40):
+            driven = generation_tracks(settings(revisited_share=share, tracks=tracks), log)
+            log.append({"tracks": driven, "returns": [[float(track % 23) for track in driven]]})
+        new = {track for entry in log for track in entry["tracks"]}
+        too_early = 6 * tracks * share  # the first generations find nothing that has rested
+        assert 40 * tracks * share - too_early <= 40 * tracks - len(new) <= 40 * tracks * share
 
 
 def test_going_back_to_hard_tracks_survives_an_interruption(quick_run, tmp_path):
