@@ -1,4 +1,4 @@
-"""V, the difference auto encoder: a variational auto encoder in the four variants of the paper (section 3.3).
+"""V, the difference auto encoder: World Models' variational auto encoder, and the three of the paper (section 3.3).
 
     variant        V sees                 V redraws
     frame          frame                  frame                  World Models' own
@@ -6,8 +6,9 @@
     output         frame                  frame + difference
     input_output   frame + difference     frame + difference
 
-The paper's figures of the two networks are not public. So the layers are World Models' (four strided convolutions down,
-four transposed ones up), and frame and difference are stacked as six channels instead of three.
+The paper's figures of the two networks are missing from the source that we have. So the layers are World Models' (four
+strided convolutions down, four transposed ones up), and frame and difference are stacked as six channels instead of
+three.
 """
 
 from collections.abc import Callable

@@ -324,7 +324,8 @@ def bootstrap(returns: np.ndarray) -> list[float]:
     """95% interval of the mean of returns (seeds, tracks), by a bootstrap of seeds and, within each, of tracks.
 
     All seeds drive the same tracks, but each drives them in its own way, so tracks are drawn anew for every seed
-    (a stratified bootstrap, as Agarwal et al., 2021, propose for few runs). Three seeds are few: it is a rough one.
+    (a bootstrap in two stages; Agarwal et al., 2021, argue for bootstrap intervals where runs are few, and resample
+    the runs of each task). Three seeds are few: it is a rough one.
     """
     rng, (seeds, tracks) = np.random.default_rng(0), returns.shape
     drawn = rng.integers(seeds, size=(RESAMPLES, seeds, 1))
