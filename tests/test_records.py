@@ -4,6 +4,11 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
+
+from stad_lab.agent import PRETRAINED
+from stad_lab.autoencoder import VARIANTS
+from stad_lab.checkpoints import load_json
 from stad_lab.replication import ROWS, kept_rows, stage_times, summarise
 from stad_lab.settings import Settings
 
@@ -69,6 +74,17 @@ def test_the_readme_s_rows_are_the_replication_s():
         counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}"]
         scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
         assert cells(f"`{name}`") == [seeds, *scores, *counts]
+
+
+def test_the_readme_tells_of_the_shipped_agents_on_other_tracks():
+    told = []
+    for variant in VARIANTS:
+        found, folder = load_json(RECORDS / "other_tracks" / f"{variant}.json"), PRETRAINED / "second_round" / variant
+        assert [episode["track"] for episode in found["episodes"]] == list(range(100, 200))
+        assert found["controller_sha256"] == load_json(folder / "evaluation.json")["controller_sha256"]
+        mean = np.mean([episode["return"] for episode in found["episodes"]])
+        told.append(f"{mean:.1f} (`{variant}`)")
+    assert f"{', '.join(told[:3])} and {told[3]}" in README
 
 
 def test_the_readme_s_times_are_those_of_whole_runs_and_keep_the_promise():
