@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
@@ -76,11 +77,13 @@ def test_the_readme_s_rows_are_the_replication_s():
         assert cells(f"`{name}`") == [seeds, *scores, *counts]
 
 
-def test_the_readme_tells_of_the_shipped_agents_on_other_tracks():
+@pytest.mark.parametrize("first", [0, 100])
+def test_the_readme_tells_how_the_shipped_agents_drive_with_the_fast_renderer(first):
     told = []
     for variant in VARIANTS:
-        found, folder = load_json(RECORDS / "other_tracks" / f"{variant}.json"), PRETRAINED / "second_round" / variant
-        assert [episode["track"] for episode in found["episodes"]] == list(range(100, 200))
+        found, folder = load_json(RECORDS / "fast" / f"{variant}_{first}.json"), PRETRAINED / "second_round" / variant
+        assert [episode["track"] for episode in found["episodes"]] == list(range(first, first + 100))
+        assert found["renderer"] == "fast"
         assert found["controller_sha256"] == load_json(folder / "evaluation.json")["controller_sha256"]
         mean = np.mean([episode["return"] for episode in found["episodes"]])
         told.append(f"{mean:.1f} (`{variant}`)")
