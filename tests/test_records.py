@@ -81,7 +81,7 @@ def test_the_readme_s_rows_are_the_replication_s():
 def test_the_readme_tells_how_the_shipped_agents_drive_with_the_fast_renderer(first):
     told = []
     for variant in VARIANTS:
-        found, folder = load_json(RECORDS / "fast" / f"{variant}_{first}.json"), PRETRAINED / "second_round" / variant
+        found, folder = read(f"fast/{variant}_{first}.json"), PRETRAINED / "second_round" / variant
         assert [episode["track"] for episode in found["episodes"]] == list(range(first, first + 100))
         assert found["renderer"] == "fast"
         assert found["controller_sha256"] == load_json(folder / "evaluation.json")["controller_sha256"]
