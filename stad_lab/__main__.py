@@ -1,4 +1,7 @@
-"""The command line, `python -m stad_lab`: check, train, evaluate, verify, replicate, study, benchmark, film, ship."""
+"""The command line, `python -m stad_lab`.
+
+Commands: check, train, finish, evaluate, verify, replicate, study, benchmark, ship, film.
+"""
 
 import argparse
 import contextlib
@@ -16,11 +19,12 @@ if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports t
     print(report := check_environment())
     sys.exit(0 if report.ok else 1)
 
-from stad_lab.agent import load_agent
+from stad_lab.agent import load_agent, run_folder
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.benchmark import PARTS, benchmark
 from stad_lab.checkpoints import check_writable, load_json, save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
+from stad_lab.finish import FINISH, OPEN, finish, finish_settings
 from stad_lab.parallel import TaskError
 from stad_lab.pipeline import STAGES, ship, train
 from stad_lab.replication import FLOORS, ROWS, describe_forecast, describe_row, forecast, keep, replicate
@@ -78,6 +82,24 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="NAME=VALUE",
         help="change one setting of the preset, for example --set stride=2; may be repeated."
         f" The settings: {', '.join(field.name for field in dataclasses.fields(Settings))}",
+    )
+
+    command = commands.add_parser(
+        "finish",
+        parents=[variant, scheduler],
+        help="search on from a run's C, with several tracks for every agent",
+        description="Search on from the C of a finished run, with its V and M and with several tracks for every agent,"
+        " so that failures grow rare. Stop it when you like; the same command goes on where it stopped.",
+    )
+    command.add_argument("--path", type=Path, help="folder of the run; default: the agent that comes with stad_lab")
+    command.add_argument("--out", required=True, type=Path, help="folder of the finish, for example runs/finished")
+    command.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="change one setting of the finish; may be repeated. It is the run's, but for"
+        f" {', '.join(f'{name}={value}' for name, value in FINISH.items())}. These may change: {', '.join(OPEN)}",
     )
 
     command = commands.add_parser(
@@ -167,8 +189,8 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def changed_settings(preset: str | None, changes: list[str]) -> Settings:
-    """A preset with NAME=VALUE changes. Raises ValueError for a change that cannot be read."""
+def read_changes(changes: list[str]) -> dict:
+    """NAME=VALUE changes of settings as a dict. Raises ValueError for one that cannot be read."""
     kinds = {field.name: field.type for field in dataclasses.fields(Settings)}
     values = {}
     for change in changes:
@@ -181,7 +203,7 @@ def changed_settings(preset: str | None, changes: list[str]) -> Settings:
         except json.JSONDecodeError:
             hint = " (true or false)" if kinds.get(name) is bool else ""
             raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}{hint}") from None
-    return Settings.preset(preset, **values)
+    return values
 
 
 @contextlib.contextmanager
@@ -204,12 +226,18 @@ def main(arguments: list[str] | None = None) -> int:
             print(report := check_environment())
             return 0 if report.ok else 1
         elif options.command == "train":
-            settings = changed_settings(options.settings, options.set)
+            settings = Settings.preset(options.settings, **read_changes(options.set))
             with drivers(options.scheduler) as executor:
                 chosen = (options.variant, settings, options.out, options.rollouts, options.until)
                 worked = train(*chosen, executor, options.earlier)
             if not worked:
                 print(f"everything up to {options.until} is there in {options.out}: nothing to do")
+        elif options.command == "finish":
+            earlier = run_folder(options.variant, options.path)
+            settings = finish_settings(earlier, **read_changes(options.set))
+            with drivers(options.scheduler) as executor:
+                if not finish(options.variant, settings, earlier, options.out, executor):
+                    print(f"the finish is there in {options.out}: nothing to do")
         elif options.command == "evaluate":
             file = options.json or (options.path or Path()) / f"evaluation-{options.variant}.json"
             chosen = (options.variant, options.path, options.episodes, options.first_track, options.fast)
@@ -258,7 +286,7 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         again = (
             "; the same command goes on from the last checkpoint"
-            if options.command in ("train", "study", "replicate")
+            if options.command in ("train", "finish", "study", "replicate")
             else ""
         )
         print(f"\nstopped{again}", file=sys.stderr)

@@ -8,7 +8,7 @@ The folder of a run::
     evolution.json                every generation of CMA-ES
     controller.safetensors        C: the CMA mean that drove the validation tracks best
     components.safetensors        where C is searched, with `Settings.components`
-    start.safetensors             only in a second round: the earlier run's C, for the new V and M
+    start.safetensors             only in a second round or a finish: the earlier run's C, for the V and M here
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
                                   stage, and the most memory that a process has held by its end (in MB, for each start)
 """
@@ -98,7 +98,7 @@ def train(
         search = stages["controller"]
         stages["controller"] = lambda pool: carry_over(*again, folder) | search(pool)
     with locked(folder):
-        record = open_record(folder, variant, settings, earlier)
+        record = open_record(folder, variant, settings, command_of(variant, settings), earlier)
         return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder, executor)
 
 
@@ -107,7 +107,7 @@ def run_stages(
     wanted: Sequence[str],
     record: dict,
     folder: Path,
-    rollouts_folder: Path,
+    rollouts_folder: Path | None,
     executor: Executor | None,
 ) -> bool:
     """Run the wanted stages in order and keep the record of them; False if there was nothing to do."""
@@ -133,8 +133,10 @@ def run_stages(
     return worked
 
 
-def open_record(folder: Path, variant: str, settings: Settings, earlier: str | Path | None = None) -> dict:
-    """The record of the run in `folder`, or a new one; a second round's holds that of the earlier run.
+def open_record(
+    folder: Path, variant: str, settings: Settings, command: str, earlier: str | Path | None = None
+) -> dict:
+    """The record of the run in `folder`, or a new one; that of a second round or a finish holds the earlier run's.
 
     Raises:
         ValueError: the folder holds a run of another variant or of other settings.
@@ -144,7 +146,7 @@ def open_record(folder: Path, variant: str, settings: Settings, earlier: str | P
         record = {
             "variant": variant,
             "settings": settings.as_dict(),
-            "made_with": provenance(command_of(variant, settings)),
+            "made_with": provenance(command),
             "seconds": {},
         }
         if earlier is not None:
@@ -202,14 +204,15 @@ def git(*arguments: str) -> str | None:
         return None
 
 
-def budget(settings: Settings, folder: Path, rollouts_folder: Path) -> dict:
+def budget(settings: Settings, folder: Path, rollouts_folder: Path | None) -> dict:
     """Every logged episode and frame that was driven for this run, by what it was driven for.
 
-    What an earlier run has cost is in that run's record, which lies in this one's: `total_budget` adds it.
+    What an earlier run has cost is in that run's record, which lies in this one's: `total_budget` adds it. A finish
+    has no rollouts of its own.
     """
     spent = {"random": {"episodes": 0, "frames": 0}}
     numbers = order_of_episodes(settings) if settings.agent_episodes else range(settings.episodes)
-    for block in load_json(rollouts_folder / "manifest.json")["blocks"]:
+    for block in load_json(rollouts_folder / "manifest.json")["blocks"] if rollouts_folder else ():
         driver = "random" if numbers[block["index"]] < settings.episodes else "agent_driver"
         one = spent.setdefault(driver, {"episodes": 0, "frames": 0})
         one["episodes"] += 1

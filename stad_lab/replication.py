@@ -7,8 +7,9 @@ drives every C found on the official tracks. In the folder of a row::
     world/      rollouts, V and M
     seed0/ ...  V, M and C of one search, with its log, record.json and evaluation.json
 
-The rows of FLOORS are drivers that do not look at the road. Whatever is there already is not done again. The records
-that we report lie in `stad_lab/records/table`.
+A row of finishes has neither a first round nor a world, because it goes on from the seeds of another row. The rows of
+FLOORS are drivers that do not look at the road. Whatever is there already is not done again. The records that we report
+lie in `stad_lab/records/table`.
 """
 
 import dataclasses
@@ -32,6 +33,7 @@ from stad_lab.controller import initial_parameters, squash
 from stad_lab.evaluation import SOLVED, evaluate, report
 from stad_lab.evaluation import summarise as summarise_episodes
 from stad_lab.evolution import CONTROLLER, LOG, drive_generation
+from stad_lab.finish import FINISH, finish
 from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
 from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.pipeline import provenance, total_budget, train
@@ -68,6 +70,8 @@ class Row:
     """Of the searches for C. V and M, and a first round, are made once."""
     world: str | None = None
     """Name of the row whose rollouts, V and M it shares; None for its own."""
+    base: str | None = None
+    """Name of the row whose searches it goes on from, seed by seed, with a finish."""
 
 
 def make_rows() -> dict[str, Row]:
@@ -82,6 +86,11 @@ def make_rows() -> dict[str, Row]:
     second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
+    # 15 x 256 + 3 x 16 episodes more, and 480 agents: 8,594 episodes and 4,000 agents in all.
+    finished = dataclasses.replace(second, **FINISH)
+    for variant in VARIANTS:
+        base = f"two_rounds_{variant}"
+        rows[f"finished_{variant}"] = Row(variant, "our recipe and a finish", finished, base=base)
     longer = dataclasses.replace(second, generations=160, sigma_decay=0.99)
     rows["long_input"] = Row("input", "our recipe, four times as long", longer, first, (0,), "two_rounds_input")
     never_back = dataclasses.replace(second, revisited_share=0.0)
@@ -141,6 +150,8 @@ def replicate(
     if name in FLOORS:
         return drive_floor(name, Path(folder) / name / "seed0", executor)
     row, folder = find_row(name, seeds), Path(folder)
+    if row.base:
+        return finish_row(name, row, folder, executor)
     first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
     for seed in row.seeds:
         search(row, seed, folder / name / f"seed{seed}", first, world, executor)
@@ -194,6 +205,17 @@ def drive_blindly(name: str, track: int) -> tuple[float, int]:
     return total, frames
 
 
+def finish_row(name: str, row: Row, folder: Path, executor: Executor | None) -> dict:
+    """Make a row of finishes, and those seeds of its base that are not there; returns as `replicate`."""
+    for seed in row.seeds:
+        base, own = (folder / part / f"seed{seed}" for part in (row.base, name))
+        if not (base / "evaluation.json").exists():
+            replicate(row.base, folder, executor, [seed])
+        worked = finish(row.variant, dataclasses.replace(row.settings, evolution_seed=seed), base, own, executor)
+        evaluate_row(row, own, worked, executor)
+    return summarise([folder / name / f"seed{seed}" for seed in row.seeds])
+
+
 def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path | None, Path]:
     """Make a row's rollouts, V and M, and before them its first round: the folders of both."""
     first, world = folder / "first" if row.first else None, folder / "world"
@@ -204,7 +226,7 @@ def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path 
 
 
 def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, executor: Executor | None) -> None:
-    """Search for C with one seed, drive what was found on the official tracks, and write `evaluation.json`.
+    """Search for C with one seed, and drive what was found on the official tracks.
 
     Where a search begins, and along which components, depends on the world alone: the first seed finds it for all.
     """
@@ -217,6 +239,11 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
             shutil.copy(source, folder)
     settings = dataclasses.replace(row.settings, evolution_seed=seed)
     worked = train(row.variant, settings, folder, world / "rollouts", executor=executor, earlier=first)
+    evaluate_row(row, folder, worked, executor)
+
+
+def evaluate_row(row: Row, folder: Path, worked: bool, executor: Executor | None) -> None:
+    """Drive what a search found on the official tracks, and write `evaluation.json`, if it is new or was not driven."""
     if worked or not (folder / "evaluation.json").exists():
         save_json(folder / "evaluation.json", evaluate(row.variant, folder, TRACKS, executor=executor))
 
@@ -343,22 +370,28 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
     if name in FLOORS:
         return {"evaluations": TRACKS * 1000 / (Settings().processes * blind_speed(name))}
     row = find_row(name, seeds)
+    if row.base:
+        times, before = forecast(row.base, row.seeds), ROWS[row.base].settings
+        longer = most_frames(row.settings) / most_frames(before)
+        return times | {"finishes": times["searches"] * longer, "evaluations": 2 * times["evaluations"]}
     with tempfile.TemporaryDirectory() as folder:
         speed = speeds(row, Path(folder))
     rounds = [row.first, row.settings] if row.first else [row.settings]
-    looks = [s.generations // s.validate_every * s.validation_tracks for s in rounds]
-    driven = [
-        (s.generations * s.population * s.tracks + look) * s.max_frames for s, look in zip(rounds, looks, strict=True)
-    ]
     return {
         "rollouts": sum(s.episodes * s.episode_frames + s.agent_episodes * s.max_frames for s in rounds)
         / speed["V, M, C"],
         "V": sum(s.v_steps * s.v_batch for s in rounds) / speed["V"],
         "M": sum(s.m_steps * s.m_batch * s.m_sequence for s in rounds) / speed["M"],
-        "first search": driven[0] / speed["V, M, C"] if row.first else 0.0,
-        "searches": len(row.seeds) * driven[-1] / speed["V, M, C"],
+        "first search": most_frames(row.first) / speed["V, M, C"] if row.first else 0.0,
+        "searches": len(row.seeds) * most_frames(row.settings) / speed["V, M, C"],
         "evaluations": len(row.seeds) * TRACKS * 1000 / speed["official"],
     }
+
+
+def most_frames(settings: Settings) -> int:
+    """How many frames a search for C drives at most, with its looks at the validation tracks."""
+    looks = settings.generations // settings.validate_every * settings.validation_tracks
+    return (settings.generations * settings.population * settings.tracks + looks) * settings.max_frames
 
 
 def speeds(row: Row, folder: Path) -> dict[str, float]:

@@ -50,14 +50,14 @@ def sizes(world_model: WorldModel) -> tuple[int, int]:
 
 
 def search_space(settings: Settings, world_model: WorldModel, folder: Path) -> SearchSpace:
-    """Where the search of a run goes on, and from where: from nothing, or in a second round from the C of before.
+    """Where the search of a run goes on, and from where: from nothing, or from the C of an earlier run.
 
     Raises:
         ValueError, FileNotFoundError: the file of that C or of the components is damaged, missing, or for another V
             and M.
     """
     start = initial_parameters(*sizes(world_model), settings.initial_gas)
-    if settings.agent_episodes:
+    if settings.agent_episodes or (folder / START).exists():  # a finish may follow a run of one round
         start = load_start(folder / START, world_model)
     if settings.components:
         directions = load_directions(folder / COMPONENTS, world_model)
@@ -69,7 +69,7 @@ def search_space(settings: Settings, world_model: WorldModel, folder: Path) -> S
 
 
 def load_start(path: Path, world_model: WorldModel) -> np.ndarray:
-    """The C that a second round starts from, float64 (parameters,). Raises as `search_space`."""
+    """The C that a second round or a finish starts from, float64 (parameters,). Raises as `search_space`."""
     tensors, facts = load_tensors(path, MAKE_AGAIN)
     check_partner(path, facts, **world_model.identities)
     parameters = tensors["parameters"].numpy()

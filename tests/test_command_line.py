@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from stad_lab.__main__ import changed_settings, main
+from stad_lab.__main__ import main, read_changes
 from stad_lab.agent import save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, save_autoencoder
 from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
@@ -146,7 +146,7 @@ def test_the_command_in_a_record_asks_for_the_settings_of_that_record():
     said = shlex.split(command_of("input", settings))
     changes = [said[place + 1] for place, word in enumerate(said) if word == "--set"]
     assert len(changes) == 4
-    assert changed_settings(said[said.index("--settings") + 1], changes) == settings
+    assert Settings.preset(said[said.index("--settings") + 1], **read_changes(changes)) == settings
 
 
 @pytest.mark.parametrize(("name", "options"), [("drive.gif", []), ("drive.webp", ["--viewer"])])

@@ -37,6 +37,7 @@ ROOMS = [
     "second_round",
     "evaluation",
     "pipeline",
+    "finish",
     "verify",
     "cluster",
     "study",

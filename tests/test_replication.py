@@ -184,13 +184,16 @@ def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long(m
 
 def test_every_row_has_the_budget_that_the_table_promises():
     for name, row in ROWS.items():
-        rounds = [row.first, row.settings] if row.first else [row.settings]
+        before = ROWS[row.base] if row.base else row
+        rounds = [settings for settings in (before.first, before.settings, row.base and row.settings) if settings]
         agents = sum(settings.generations * settings.population for settings in rounds)
         looks = sum(settings.generations // settings.validate_every * settings.validation_tracks for settings in rounds)
         driven = sum(settings.generations * settings.population * settings.tracks for settings in rounds)
         episodes = row.settings.episodes + row.settings.agent_episodes + driven + looks
         if name != "long_input":  # which asks what more would bring
-            assert agents <= 4800 and (name.startswith("paper") or episodes <= 4800), (name, agents, episodes)
+            assert agents <= 4800 and (name.startswith(("paper", "finished")) or episodes <= 4800), name
+        if row.base:
+            assert (agents, episodes) == (4000, 8594) and before.variant == row.variant and before.seeds == row.seeds
     assert {row.variant for name, row in ROWS.items() if name.startswith("two_rounds") and len(row.seeds) >= 3} == {
         "frame",
         "input",
@@ -229,6 +232,9 @@ def test_some_seeds_of_a_row_can_be_made_alone(table, monkeypatch):
     whole, one = forecast("one_round"), forecast("one_round", seeds=[2])
     for part, share in {"rollouts": 1, "V": 1, "M": 1, "searches": 3, "evaluations": 3}.items():
         assert whole[part] == pytest.approx(share * one[part])
+    base, finished = (forecast(f"{recipe}_frame", seeds=[0]) for recipe in ("two_rounds", "finished"))
+    longer = (15 * 32 * 8 + 3 * 16) / (40 * 64 + 8 * 16)
+    assert finished == base | {"finishes": base["searches"] * longer, "evaluations": 2 * base["evaluations"]}
 
 
 def test_the_command_keeps_what_is_finished(tmp_path, capsys):

@@ -1,0 +1,134 @@
+"""A finish: the same V and M, a search from the C of before, and one budget for all of it."""
+
+import functools
+import shlex
+import shutil
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+from stad_lab import replication
+from stad_lab.__main__ import main, read_changes
+from stad_lab.agent import load_agent, load_controller, read_world_model
+from stad_lab.checkpoints import load_json
+from stad_lab.evaluation import evaluate
+from stad_lab.evolution import LOG
+from stad_lab.finish import FINISH, finish, finish_settings
+from stad_lab.pipeline import ship, total_budget
+from stad_lab.search_space import load_start, search_space
+from stad_lab.settings import Settings
+from stad_lab.verify import verify
+
+VARIANT = "input_output"
+BRIEF = {"generations": 4, "population": 4, "tracks": 2, "validate_every": 2}
+
+
+def go(earlier, folder, **changes):
+    """A brief finish of the run in `earlier`; returns what `finish` does."""
+    with ThreadPoolExecutor(1) as executor:
+        return finish(VARIANT, finish_settings(earlier, **BRIEF | changes), earlier, folder, executor)
+
+
+@pytest.fixture(scope="module")
+def finished(quick_run, tmp_path_factory):
+    """The folder of a finish of the quick run."""
+    folder = tmp_path_factory.mktemp("finish") / "run"
+    assert go(quick_run, folder)
+    return folder
+
+
+def test_a_finish_begins_at_the_controller_of_before_on_the_same_world_model(finished, quick_run):
+    world_model = read_world_model(finished, VARIANT)
+    before, _ = load_controller(quick_run / "controller.safetensors", VARIANT)
+    assert world_model.identities == read_world_model(quick_run, VARIANT).identities
+    assert np.array_equal(load_start(finished / "start.safetensors", world_model), before)
+    space = search_space(finish_settings(quick_run, **BRIEF), world_model, finished)
+    assert np.array_equal(space.expand(space.first), before)
+    after, _ = load_controller(finished / "controller.safetensors", VARIANT)
+    assert 0 < np.abs(after - before).max() < 1  # small steps away from it
+
+
+def test_every_agent_of_a_finish_drives_new_tracks_and_hard_ones_of_before(finished):
+    generations = load_json(finished / LOG)["generations"]
+    assert all(np.shape(entry["returns"]) == (4, 2) and len(set(entry["tracks"])) == 2 for entry in generations)
+    assert FINISH["tracks"] == 8 and FINISH["revisited_share"] == 0.5
+
+
+def test_a_finish_adds_its_episodes_and_agents_to_those_of_before(finished, quick_run):
+    record, before = load_json(finished / "record.json"), load_json(quick_run / "record.json")
+    assert record["earlier"] == before
+    mine, first, both = record["budget"], total_budget(before), total_budget(record)
+    assert both["agents"] == first["agents"] + 16 and mine["random"]["episodes"] == 0
+    assert both["episodes"] == first["episodes"] + 4 * 4 * 2 + 2 * 2
+    assert both["frames"] == first["frames"] + mine["evolution"]["frames"] + mine["validation"]["frames"]
+
+
+def test_a_finish_goes_on_where_it_stopped_and_ends_with_the_same_bits(finished, quick_run, tmp_path):
+    assert go(quick_run, tmp_path / "run", generations=2)
+    assert go(quick_run, tmp_path / "run")
+    for name in ("controller.safetensors", "start.safetensors"):
+        assert (tmp_path / "run" / name).read_bytes() == (finished / name).read_bytes()
+    assert load_json(tmp_path / "run" / LOG) == load_json(finished / LOG)
+    assert not go(quick_run, tmp_path / "run")
+
+
+def test_a_finish_is_verified_and_shipped_like_a_second_round(finished, tmp_path):
+    shipped = ship(VARIANT, finished, tmp_path)
+    assert load_agent(VARIANT, shipped).parameters.size == load_agent(VARIANT, finished).parameters.size
+    for folder in (finished, shipped):
+        found = verify(folder)
+        assert found["log of CMA-ES"] == "ok: 4 generations lead to the same mean" and found["C"].startswith("ok")
+        assert not any(outcome.startswith("FAILED") for outcome in found.values())
+
+
+def test_settings_that_v_depends_on_are_refused_before_anything_is_written(quick_run, tmp_path):
+    with pytest.raises(ValueError, match=r"holds a run with width=8, and now width=16 is asked for"):
+        go(quick_run, tmp_path / "run", width=16)
+    with pytest.raises(ValueError, match=r"holds a run with variant='input_output', and now variant='frame'"):
+        finish("frame", finish_settings(quick_run), quick_run, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_has_no_controller_yet_is_refused_before_anything_is_written(quick_run, tmp_path):
+    folder = shutil.copytree(quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("controller*", "rollouts"))
+    with pytest.raises(FileNotFoundError, match=r"controller.safetensors"):
+        go(folder, tmp_path / "run")
+    with pytest.raises(FileNotFoundError, match=r"record.json.*give the folder of a first run"):
+        go(tmp_path, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_command_finishes_a_run_and_its_record_says_how(finished, quick_run, tmp_path, capsys):
+    made_with = load_json(finished / "record.json")["made_with"]
+    said = shlex.split(made_with["command"])
+    places = {"--path": quick_run, "--out": tmp_path / "run"}
+    arguments = [str(places.get(before, word)) for before, word in zip(["", *said], said, strict=False)]
+    assert arguments[:4] == ["python", "-m", "stad_lab", "finish"]
+    changes = read_changes([word for before, word in zip(["", *said], said, strict=False) if before == "--set"])
+    assert changes == {name: BRIEF[name] for name in BRIEF if BRIEF[name] != FINISH[name]}
+    for outcome in ("controller: done", "the finish is there"):
+        assert main(arguments[3:]) == 0
+        assert outcome in capsys.readouterr().out
+    assert (tmp_path / "run" / LOG).read_bytes() == (finished / LOG).read_bytes()
+
+
+def test_a_row_of_finishes_goes_on_from_the_seeds_of_its_base(monkeypatch, tmp_path):
+    settings = Settings.preset("quick", processes=1, generations=2, v_steps=8, m_steps=4)
+    last = Settings.from_dict(settings.as_dict() | FINISH | BRIEF | {"generations": 2})
+    monkeypatch.setitem(replication.ROWS, "first", replication.Row("input", "before", settings, seeds=(0, 1)))
+    monkeypatch.setitem(replication.ROWS, "last", replication.Row("input", "after", last, seeds=(0, 1), base="first"))
+    monkeypatch.setattr(replication, "TRACKS", 1)
+    monkeypatch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
+    with ThreadPoolExecutor(1) as executor:
+        found = replication.replicate("last", tmp_path, executor, seeds=[1])
+        assert not (tmp_path / "first" / "seed0").exists() and (tmp_path / "first" / "seed1").exists()
+        before = (tmp_path / "first" / "seed1" / LOG).stat().st_mtime_ns
+        assert replication.replicate("last", tmp_path, executor, seeds=[1]) == found
+    assert (tmp_path / "first" / "seed1" / LOG).stat().st_mtime_ns == before
+    log = load_json(tmp_path / "last" / "seed1" / LOG)
+    assert log["settings"]["evolution_seed"] == 1 and log["settings"]["tracks"] == 2
+    base = replication.summarise([tmp_path / "first" / "seed1"])
+    assert found["agents"] == base["agents"] + 2 * 4 and found["episodes"] == base["episodes"] + 2 * 4 * 2 + 2
+    episodes, scores = replication.learning_curve(tmp_path / "last" / "seed1")
+    assert episodes.tolist() == [found["episodes"]] and len(scores) == 1
