@@ -20,7 +20,7 @@ if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports t
     sys.exit(0 if report.ok else 1)
 
 from stad_lab.agent import load_agent, run_folder
-from stad_lab.autoencoder import VARIANTS
+from stad_lab.autoencoder import VARIANTS, check_variant
 from stad_lab.benchmark import PARTS, benchmark
 from stad_lab.checkpoints import check_writable, load_json, save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
@@ -233,6 +233,7 @@ def main(arguments: list[str] | None = None) -> int:
             if not worked:
                 print(f"everything up to {options.until} is there in {options.out}: nothing to do")
         elif options.command == "finish":
+            check_variant(options.variant)
             earlier = run_folder(options.variant, options.path)
             settings = finish_settings(earlier, **read_changes(options.set))
             with drivers(options.scheduler) as executor:

@@ -118,6 +118,15 @@ def read_bytes(path: Path, remedy: str) -> bytes:
         ) from error
 
 
+def copy_file(source: Path, folder: Path) -> None:
+    """Copy a file into a folder under its own name, so that a kill at any moment leaves all of it or nothing.
+
+    Raises:
+        OSError: it cannot be read or written.
+    """
+    write_bytes(folder / source.name, read_bytes(source, "make it again"))
+
+
 def checksum(content: bytes) -> str:
     """SHA-256 of some bytes, in hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()

@@ -4,23 +4,23 @@ CMA-ES ranks. Where every agent drives one track in a generation, the fastest le
 lose hundreds of points on one in twenty counts in as few generations. In a finish every agent drives eight tracks, and
 in their mean a single failure weighs more than all that haste can gain. That costs eight times the episodes for an
 agent, so it is kept for the end, when small steps from a good C are enough. Nothing is collected or trained.
+
+Tracks and mutations are drawn with the seeds of the earlier run, by the number of the generation: of four new tracks of
+a generation, the first is one that it has driven as well.
 """
 
-import shlex
-import shutil
 from concurrent.futures import Executor
 from pathlib import Path
 
 import torch
 
-from stad_lab.agent import load_controller, read_world_model
+from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.autoencoder import check_variant
-from stad_lab.checkpoints import load_json, locked, save_tensors
-from stad_lab.evolution import CONTROLLER, evolve
-from stad_lab.mdn_rnn import check_partner
-from stad_lab.pipeline import EARLIER, open_record, run_stages
-from stad_lab.search_space import COMPONENTS, START, load_start
-from stad_lab.settings import Settings, check_same_run, known_fields
+from stad_lab.checkpoints import copy_file, load_json, locked, save_tensors
+from stad_lab.evolution import CONTROLLER, LOG, evolve
+from stad_lab.pipeline import EARLIER, open_record, run_stages, set_options
+from stad_lab.search_space import COMPONENTS, START, load_directions, load_start
+from stad_lab.settings import Settings
 
 FINISH = {  # what it changes in the settings of the run that it goes on from
     "generations": 15,
@@ -32,7 +32,7 @@ FINISH = {  # what it changes in the settings of the run that it goes on from
     "validate_every": 5,
     "averaged_share": 0.5,
 }
-OPEN = (*FINISH, "evolution_seed", "validation_tracks", "cars", "processes")  # what may be changed; no V depends on it
+OPEN = (*FINISH, "evolution_seed", "validation_tracks", "cars", "processes")  # what may be changed
 
 
 def finish_settings(earlier: str | Path, **changes) -> Settings:
@@ -42,7 +42,7 @@ def finish_settings(earlier: str | Path, **changes) -> Settings:
         ValueError, FileNotFoundError: an unknown field, a value out of range, or no record of a run.
     """
     record = load_json(Path(earlier) / "record.json", EARLIER)
-    return Settings.from_dict(record["settings"] | FINISH | known_fields(changes))
+    return Settings.from_dict(record["settings"] | FINISH | changes)
 
 
 def finish(
@@ -60,50 +60,67 @@ def finish(
         False if everything was finished already and nothing was done.
 
     Raises:
-        ValueError: settings on which V or M depend are not the earlier run's, or `folder` holds another run.
-        FileNotFoundError: the earlier run has no record, or no C yet.
+        ValueError: a setting outside OPEN is not the earlier run's, that run is damaged or not at its end, or `folder`
+            holds another run.
+        FileNotFoundError: the earlier run lacks a file.
         OSError, TaskError: as `evolve`.
     """
     check_variant(variant)
     earlier, folder = Path(earlier), Path(folder)
-    record = load_json(earlier / "record.json", EARLIER)
-    fixed = {name: value for name, value in settings.as_dict().items() if name not in OPEN}
-    check_same_run(earlier, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **fixed})
+    before = check_earlier(variant, settings, earlier)
     stages = {
         "controller": lambda pool: begin_finish(variant, earlier, folder) | evolve(variant, settings, folder, pool)
     }
-    load_controller(earlier / CONTROLLER, variant)
+    command = f"python -m stad_lab finish --variant {variant} --path ... --out ..."
+    command += set_options(settings, finish_settings(earlier))
     with locked(folder):
-        record = open_record(folder, variant, settings, command_of(variant, settings, earlier), earlier)
+        record = open_record(folder, variant, settings, command, earlier)
+        if record.get("earlier") != before:
+            raise ValueError(
+                f"{folder} does not hold a finish of {earlier} as it is now: choose another folder, or give the run"
+                " that it goes on from"
+            )
         return run_stages(stages, ["controller"], record, folder, None, executor)
 
 
+def check_earlier(variant: str, settings: Settings, earlier: Path) -> dict:
+    """The record of the earlier run, if a finish with these settings can go on from it. Raises as `finish`."""
+    record = load_json(earlier / "record.json", EARLIER)
+    was = {"variant": record["variant"], **Settings.from_dict(record["settings"]).as_dict()}
+    for name, value in {"variant": variant, **settings.as_dict()}.items():
+        if name not in OPEN and was[name] != value:
+            raise ValueError(
+                f"{name}={value!r}, but the run in {earlier} has {was[name]!r}: leave it so, a finish may change"
+                f" {', '.join(OPEN)} alone"
+            )
+    load_agent(variant, earlier)
+    if settings.components:
+        load_directions(earlier / COMPONENTS, read_world_model(earlier, variant))
+    log, whole = load_json(earlier / LOG, EARLIER)["generations"], was["generations"] * was["population"]
+    if len(log) != was["generations"] or record.get("budget", {}).get("agents") != whole:
+        raise ValueError(
+            f"the search in {earlier} is not at its end, with {len(log)} of {was['generations']} generations: run its"
+            " own command to the end first"
+        )
+    return record
+
+
 def begin_finish(variant: str, earlier: Path, folder: Path) -> bool:
-    """Copy V, M and the components of the earlier run, and write its C as `start.safetensors`.
+    """Copy V, M and the components of the earlier run, and write its C as `start.safetensors`, the last of them.
 
     Returns:
-        False if they were there already.
+        False if that was there already.
 
     Raises:
-        ValueError, FileNotFoundError: a file of one of the runs is damaged, missing, or belongs to another run.
+        ValueError, OSError: a file of one of the runs is damaged, or belongs to another run, or cannot be written.
     """
     for name in ("autoencoder.safetensors", "mdn_rnn.safetensors", COMPONENTS):
         if (earlier / name).exists() and not (folder / name).exists():
-            shutil.copy(earlier / name, folder)
+            copy_file(earlier / name, folder)
     path, world_model = folder / START, read_world_model(folder, variant)
     if path.exists():
         load_start(path, world_model)
         return False
-    parameters, facts = load_controller(earlier / CONTROLLER, variant)
-    check_partner(earlier / CONTROLLER, facts, **world_model.identities)
-    start = {"parameters": torch.from_numpy(parameters)}
+    start = {"parameters": torch.from_numpy(load_controller(earlier / CONTROLLER, variant)[0])}
     save_tensors(path, start, part="start", variant=variant, **world_model.identities)
     return True
-
-
-def command_of(variant: str, settings: Settings, earlier: Path) -> str:
-    """The command line that makes a finish of these settings again."""
-    usual = finish_settings(earlier).as_dict()
-    changed = [f"{name}={value}" for name, value in settings.as_dict().items() if value != usual[name]]
-    changes = [f"--set {shlex.quote(change)}" for change in changed]
-    return " ".join([f"python -m stad_lab finish --variant {variant} --path ... --out ...", *changes])

@@ -42,7 +42,7 @@ STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
 WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, COMPONENTS, "controller.safetensors")
-EARLIER = "give the folder of a first run, as `python -m stad_lab train --out` makes it"
+EARLIER = "give the folder of a run, as `python -m stad_lab train --out` makes it"
 
 
 def train(
@@ -162,11 +162,16 @@ def open_record(
 
 def command_of(variant: str, settings: Settings) -> str:
     """The command line that makes a run of these settings again."""
-    preset = Settings.preset(settings.name).as_dict()
-    changed = [f"{name}={value}" for name, value in settings.as_dict().items() if value != preset[name]]
-    changes = [f"--set {shlex.quote(change)}" for change in changed]
-    changes += ["--earlier ..."] if settings.agent_episodes else []
-    return " ".join([f"python -m stad_lab train --variant {variant} --settings {settings.name} --out ...", *changes])
+    command = f"python -m stad_lab train --variant {variant} --settings {settings.name} --out ..."
+    changes = set_options(settings, Settings.preset(settings.name))
+    return command + changes + (" --earlier ..." if settings.agent_episodes else "")
+
+
+def set_options(settings: Settings, usual: Settings) -> str:
+    """What a command line says to have these settings instead of the usual ones: " --set NAME=VALUE" of each change."""
+    before = usual.as_dict()
+    changed = [f"{name}={value}" for name, value in settings.as_dict().items() if value != before[name]]
+    return "".join(f" --set {shlex.quote(change)}" for change in changed)
 
 
 def provenance(command: str) -> dict:
@@ -252,7 +257,7 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     """Copy what a run has trained into `stad_lab/pretrained/`: records as they are, V and M in half precision.
 
     Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run. A second
-    round goes into a folder `second_round` of its own; returns the new folder.
+    round, or a finish, goes into a folder `second_round` of its own; returns the new folder.
 
     Raises:
         FileNotFoundError: the run has no V.

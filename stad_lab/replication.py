@@ -28,7 +28,7 @@ from tqdm.auto import tqdm
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder, save_autoencoder
 from stad_lab.benchmark import train_m, train_v
 from stad_lab.car_racing import make_env
-from stad_lab.checkpoints import load_json, save_json
+from stad_lab.checkpoints import copy_file, load_json, save_json
 from stad_lab.controller import initial_parameters, squash
 from stad_lab.evaluation import SOLVED, evaluate, report
 from stad_lab.evaluation import summarise as summarise_episodes
@@ -39,7 +39,7 @@ from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.pipeline import provenance, total_budget, train
 from stad_lab.rollouts import RandomDriver, collect_rollouts
 from stad_lab.search_space import COMPONENTS, START
-from stad_lab.settings import Settings
+from stad_lab.settings import Settings, check_same_run
 
 RECORDS = Path(__file__).parent / "records" / "table"
 KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every run, as far as it has them
@@ -63,7 +63,7 @@ class Row:
     about: str
     """What is special about it, for the reader."""
     settings: Settings
-    """Of the only round, or of the second."""
+    """Of the only round, of the second, or of the finish."""
     first: Settings | None = None
     """Of the first round, in a recipe of two."""
     seeds: tuple[int, ...] = (0, 1, 2)
@@ -211,7 +211,9 @@ def finish_row(name: str, row: Row, folder: Path, executor: Executor | None) -> 
         base, own = (folder / part / f"seed{seed}" for part in (row.base, name))
         if not (base / "evaluation.json").exists():
             replicate(row.base, folder, executor, [seed])
-        worked = finish(row.variant, dataclasses.replace(row.settings, evolution_seed=seed), base, own, executor)
+        searches = [dataclasses.replace(one.settings, evolution_seed=seed) for one in (ROWS[row.base], row)]
+        check_same_run(base, load_json(base / "record.json")["settings"], searches[0].as_dict())
+        worked = finish(row.variant, searches[1], base, own, executor)
         evaluate_row(row, own, worked, executor)
     return summarise([folder / name / f"seed{seed}" for seed in row.seeds])
 
@@ -236,7 +238,7 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
     made += [path for part in (COMPONENTS, START) for path in folder.parent.glob(f"seed*/{part}")]
     for source in made:
         if not (folder / source.name).exists():
-            shutil.copy(source, folder)
+            copy_file(source, folder)
     settings = dataclasses.replace(row.settings, evolution_seed=seed)
     worked = train(row.variant, settings, folder, world / "rollouts", executor=executor, earlier=first)
     evaluate_row(row, folder, worked, executor)

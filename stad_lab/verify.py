@@ -26,7 +26,7 @@ from stad_lab.evolution import (
 )
 from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.parallel import run_tasks, worker_processes
-from stad_lab.pipeline import MACHINE, PACKAGES, provenance
+from stad_lab.pipeline import EARLIER, MACHINE, PACKAGES, provenance
 from stad_lab.rollouts import Rollouts
 from stad_lab.search_space import search_space
 from stad_lab.settings import Settings
@@ -50,7 +50,7 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         ValueError: the record itself is damaged.
     """
     folder = Path(folder)
-    record = load_json(folder / "record.json", "give the folder of a run, as `python -m stad_lab train --out` makes it")
+    record = load_json(folder / "record.json", EARLIER)
     variant, settings = record["variant"], Settings.from_dict(record["settings"])
     read_rollouts = functools.cache(Rollouts)  # it checks every block, and a dataset may have 12 GB: once is enough
     checks: dict[str, Callable[[], str]] = {

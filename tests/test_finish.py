@@ -1,6 +1,7 @@
 """A finish: the same V and M, a search from the C of before, and one budget for all of it."""
 
 import functools
+import itertools
 import shlex
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -11,9 +12,9 @@ import pytest
 from stad_lab import replication
 from stad_lab.__main__ import main, read_changes
 from stad_lab.agent import load_agent, load_controller, read_world_model
-from stad_lab.checkpoints import load_json
+from stad_lab.checkpoints import load_json, save_json
 from stad_lab.evaluation import evaluate
-from stad_lab.evolution import LOG
+from stad_lab.evolution import LOG, generation_tracks
 from stad_lab.finish import FINISH, finish, finish_settings
 from stad_lab.pipeline import ship, total_budget
 from stad_lab.search_space import load_start, search_space
@@ -49,10 +50,15 @@ def test_a_finish_begins_at_the_controller_of_before_on_the_same_world_model(fin
     assert 0 < np.abs(after - before).max() < 1  # small steps away from it
 
 
-def test_every_agent_of_a_finish_drives_new_tracks_and_hard_ones_of_before(finished):
+def test_every_agent_of_a_finish_drives_four_new_tracks_and_four_hard_ones_of_before(finished, quick_run):
     generations = load_json(finished / LOG)["generations"]
     assert all(np.shape(entry["returns"]) == (4, 2) and len(set(entry["tracks"])) == 2 for entry in generations)
-    assert FINISH["tracks"] == 8 and FINISH["revisited_share"] == 0.5
+    settings, log = finish_settings(quick_run), []
+    for _ in range(6):
+        tracks = generation_tracks(settings, log)
+        log.append({"tracks": tracks, "returns": [[900.0 - place for place in range(8)]]})
+    assert log[5]["tracks"][:4] == log[0]["tracks"][:3:-1]  # the hardest ones that do not rest any more
+    assert not set(log[5]["tracks"][4:]) & {track for entry in log[:5] for track in entry["tracks"]}
 
 
 def test_a_finish_adds_its_episodes_and_agents_to_those_of_before(finished, quick_run):
@@ -75,28 +81,69 @@ def test_a_finish_goes_on_where_it_stopped_and_ends_with_the_same_bits(finished,
 
 def test_a_finish_is_verified_and_shipped_like_a_second_round(finished, tmp_path):
     shipped = ship(VARIANT, finished, tmp_path)
-    assert load_agent(VARIANT, shipped).parameters.size == load_agent(VARIANT, finished).parameters.size
+    assert np.array_equal(load_agent(VARIANT, shipped).parameters, load_agent(VARIANT, finished).parameters)
     for folder in (finished, shipped):
         found = verify(folder)
         assert found["log of CMA-ES"] == "ok: 4 generations lead to the same mean" and found["C"].startswith("ok")
         assert not any(outcome.startswith("FAILED") for outcome in found.values())
 
 
-def test_settings_that_v_depends_on_are_refused_before_anything_is_written(quick_run, tmp_path):
-    with pytest.raises(ValueError, match=r"holds a run with width=8, and now width=16 is asked for"):
-        go(quick_run, tmp_path / "run", width=16)
-    with pytest.raises(ValueError, match=r"holds a run with variant='input_output', and now variant='frame'"):
-        finish("frame", finish_settings(quick_run), quick_run, tmp_path / "run")
+def test_a_copy_that_was_cut_off_is_made_again(finished, quick_run, tmp_path, monkeypatch):
+    calls = itertools.count()
+
+    def interrupt(_):
+        if next(calls) == 2:  # after the record's file and folder: in the middle of V
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("os.fsync", interrupt)
+        go(quick_run, tmp_path / "run")
+    assert (tmp_path / "run" / "record.json").exists()
+    assert not (tmp_path / "run" / "autoencoder.safetensors").exists()
+    assert go(quick_run, tmp_path / "run")
+    assert (tmp_path / "run" / LOG).read_bytes() == (finished / LOG).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("changes", "error"),
+    [
+        ({"width": 16}, r"width=16, but the run in .* has 8: leave it so, a finish may change generations, population"),
+        ({"patience": 0}, r"patience=0, but the run in .* has 100: leave it so"),
+        ({"depth": 3}, r"unknown setting 'depth'"),
+    ],
+)
+def test_other_settings_than_those_of_a_search_are_refused_before_anything_is_written(
+    changes, error, quick_run, tmp_path
+):
+    with pytest.raises(ValueError, match=error):
+        go(quick_run, tmp_path / "run", **changes)
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_that_has_no_controller_yet_is_refused_before_anything_is_written(quick_run, tmp_path):
-    folder = shutil.copytree(quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("controller*", "rollouts"))
-    with pytest.raises(FileNotFoundError, match=r"controller.safetensors"):
+@pytest.mark.parametrize("missing", ["record.json", "autoencoder.safetensors", "controller.safetensors", LOG])
+def test_a_run_that_lacks_a_file_is_refused_before_anything_is_written(missing, quick_run, tmp_path):
+    folder = shutil.copytree(quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("rollouts"))
+    (folder / missing).unlink()
+    with pytest.raises(FileNotFoundError, match=missing):
         go(folder, tmp_path / "run")
-    with pytest.raises(FileNotFoundError, match=r"record.json.*give the folder of a first run"):
-        go(tmp_path, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_is_not_at_its_end_is_refused_before_anything_is_written(quick_run, tmp_path):
+    folder = shutil.copytree(quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("rollouts"))
+    log = load_json(folder / LOG)
+    save_json(folder / LOG, log | {"generations": log["generations"][:2]})
+    with pytest.raises(ValueError, match=r"is not at its end, with 2 of 4 generations: run its own command to the end"):
+        go(folder, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_finish_of_another_run_is_not_taken_for_this_one(finished, quick_run, tmp_path):
+    other = shutil.copytree(quick_run, tmp_path / "other", ignore=shutil.ignore_patterns("rollouts"))
+    record = load_json(other / "record.json")
+    save_json(other / "record.json", record | {"seconds": {}})
+    with pytest.raises(ValueError, match=r"does not hold a finish of .*other as it is now: choose another folder"):
+        go(other, finished)
 
 
 def test_the_command_finishes_a_run_and_its_record_says_how(finished, quick_run, tmp_path, capsys):

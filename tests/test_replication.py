@@ -274,4 +274,7 @@ def test_every_row_that_we_report_holds_its_protocol():
                 row = dataclasses.replace(ROWS[name].settings, evolution_seed=int(folder.name.removeprefix("seed")))
                 assert record["settings"] == row.as_dict() and told["renderer"] == "official"
                 assert told["controller_sha256"] == checksum((folder / "controller.safetensors").read_bytes())
-                assert total_budget(record)["episodes"] <= 4800 or name.startswith("paper")
+                if ROWS[name].base and (base := folder.parents[1] / ROWS[name].base / folder.name).exists():
+                    assert record["earlier"] == load_json(base / "record.json")
+                spent, more = total_budget(record), name.startswith(("paper", "finished"))
+                assert spent["agents"] <= 4800 and (spent["episodes"] <= 4800 or more)
