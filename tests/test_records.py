@@ -77,17 +77,21 @@ def test_the_readme_s_rows_are_the_replication_s():
         assert cells(f"`{name}`") == [seeds, *scores, *counts]
 
 
-@pytest.mark.parametrize("first", [0, 100])
-def test_the_readme_tells_how_the_shipped_agents_drive_with_the_fast_renderer(first):
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_readme_tells_how_agents_drive_with_the_fast_renderer_before_and_after_a_finish(variant):
+    row = "two_rounds_new_tracks" if variant == "input" else f"two_rounds_{variant}"
+    agents = {"two_rounds": RECORDS / "table" / row / "seed0", "finished": PRETRAINED / "second_round" / variant}
     told = []
-    for variant in VARIANTS:
-        found, folder = read(f"fast/{variant}_{first}.json"), PRETRAINED / "second_round" / variant
-        assert [episode["track"] for episode in found["episodes"]] == list(range(first, first + 100))
-        assert found["renderer"] == "fast"
-        assert found["controller_sha256"] == load_json(folder / "evaluation.json")["controller_sha256"]
-        mean = np.mean([episode["return"] for episode in found["episodes"]])
-        told.append(f"{mean:.1f} (`{variant}`)")
-    assert f"{', '.join(told[:3])} and {told[3]}" in README
+    for stage, folder in agents.items():
+        returns = []
+        for first in (0, 100):
+            found = read(f"fast/{stage}/{variant}_{first}.json")
+            assert [episode["track"] for episode in found["episodes"]] == list(range(first, first + 100))
+            assert found["renderer"] == "fast"
+            assert found["controller_sha256"] == load_json(folder / "evaluation.json")["controller_sha256"]
+            returns.append([episode["return"] for episode in found["episodes"]])
+        told += [*(f"{mean:.1f}" for mean in np.mean(returns, axis=1)), f"{(np.array(returns) < 800).sum()}"]
+    assert cells(f"`{variant}`, fast") == told
 
 
 def test_the_readme_s_times_are_those_of_whole_runs_and_keep_the_promise():
