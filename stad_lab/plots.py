@@ -455,7 +455,7 @@ def plot_episodes(
         runs: name -> for every seed its episodes and its scores at those.
         published: name -> episodes -> score, as others have reported: points without a line.
     """
-    figure, ((axis,),) = new_figure(8.0, 4.4)
+    figure, ((axis,),) = new_figure(8.0, 4.2 + 0.08 * len(runs))
     for (name, seeds), (color, dash) in zip(runs.items(), itertools.cycle(STYLES), strict=False):
         for number, (episodes, scores) in enumerate(seeds):
             axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8, label=name if number == 0 else None)
@@ -463,7 +463,8 @@ def plot_episodes(
         axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
     axis.axhline(900, color="grey", lw=0.8, ls=":")
     axis.set(xscale="log", xlabel="episodes driven in all (logarithmic)", ylabel="score", ylim=(None, 960))
-    axis.legend(frameon=False, fontsize=9)
+    # Below the axis: inside it, many names would hide the points.
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     axis.set_title(title, fontsize=11)
     last = ", ".join(f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}" for name, seeds in runs.items())
     figure.set_label(f"{title}. At the end, mean of the seeds: {last}.")
