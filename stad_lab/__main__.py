@@ -49,6 +49,8 @@ def build_parser() -> argparse.ArgumentParser:
         " difference image to what V sees, output to what it redraws)",
     )
 
+    repeated = {"action": "append", "default": [], "metavar": "NAME=VALUE"}
+
     commands.add_parser("check", help="is everything installed, and what to do about what is not")
     scheduler = argparse.ArgumentParser(add_help=False)
     scheduler.add_argument(
@@ -77,9 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument("--until", default=STAGES[-1], help=f"last stage to run: {', '.join(STAGES)}; default all")
     command.add_argument(
         "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
+        **repeated,
         help="change one setting of the preset, for example --set stride=2; may be repeated."
         f" The settings: {', '.join(field.name for field in dataclasses.fields(Settings))}",
     )
@@ -95,9 +95,7 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument("--out", required=True, type=Path, help="folder of the finish, for example runs/finished")
     command.add_argument(
         "--set",
-        action="append",
-        default=[],
-        metavar="NAME=VALUE",
+        **repeated,
         help="change one setting of the finish; may be repeated. It is the run's, but for"
         f" {', '.join(f'{name}={value}' for name, value in FINISH.items())}. These may change: {', '.join(OPEN)}",
     )

@@ -191,7 +191,11 @@ def test_every_row_has_the_budget_that_the_table_promises():
         driven = sum(settings.generations * settings.population * settings.tracks for settings in rounds)
         episodes = row.settings.episodes + row.settings.agent_episodes + driven + looks
         if name != "long_input":  # which asks what more would bring
-            assert agents <= 4800 and (name.startswith(("paper", "finished")) or episodes <= 4800), name
+            assert agents <= 4800 and (name.startswith(("paper", "finished")) or episodes <= 4800), (
+                name,
+                agents,
+                episodes,
+            )
         if row.base:
             assert (agents, episodes) == (4000, 8594) and before.variant == row.variant and before.seeds == row.seeds
     assert {row.variant for name, row in ROWS.items() if name.startswith("two_rounds") and len(row.seeds) >= 3} == {
