@@ -17,7 +17,6 @@ import importlib.metadata
 import os
 import platform
 import shlex
-import shutil
 import subprocess
 import time
 from collections.abc import Callable, Sequence
@@ -28,7 +27,7 @@ import torch
 
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoencoder
-from stad_lab.checkpoints import load_json, load_tensors, locked, save_json, save_tensors
+from stad_lab.checkpoints import copy_file, load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory, worker_processes
@@ -274,5 +273,5 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
             save_tensors(target / name, small, **facts | {"variant": variant})
     for name in ("record.json", LOG):
         if (folder / name).exists():
-            shutil.copyfile(folder / name, target / name)
+            copy_file(folder / name, target)
     return target

@@ -21,6 +21,7 @@ from stad_lab.replication import (
     WORLD_MODELS,
     Row,
     bootstrap,
+    bootstrap_gain,
     describe_forecast,
     forecast,
     keep,
@@ -215,6 +216,21 @@ def test_the_interval_covers_the_truth_more_often_than_one_over_tracks_alone():
         spread = 1.96 * returns.std() / np.sqrt(returns.size)
         narrow.append(abs(returns.mean() - 900) < spread)
     assert np.mean(hits) > 0.8 > np.mean(narrow)
+
+
+def test_the_interval_of_a_gain_shares_the_tracks_and_covers_the_luck_of_both_searches(monkeypatch):
+    monkeypatch.setattr(replication, "RESAMPLES", 1000)
+    rng, hits, narrow = np.random.default_rng(0), [], []
+    tracks = 900 + 60 * rng.standard_normal(100)
+    assert bootstrap_gain(tracks[None], tracks[None] + 5) == pytest.approx([5, 5])  # on every track
+    for _ in range(40):
+        lucks = 15 * rng.standard_normal((2, 5, 1)) + 10 * rng.standard_normal((2, 5, 100))
+        before, after = tracks + lucks[0], tracks + 10 + lucks[1]
+        low, high = bootstrap_gain(before, after)
+        hits.append(low < 10 < high)
+        low, high = bootstrap_gain(before.mean(axis=0)[None], after.mean(axis=0)[None])
+        narrow.append(low < 10 < high)
+    assert np.mean(hits) > 0.8 > 0.4 > np.mean(narrow)
 
 
 def test_an_unknown_row_ends_in_one_line_that_names_the_rows(capsys, tmp_path):
