@@ -186,7 +186,7 @@ def plot_intervals(
     rows = list(next(iter(panels.values())))
     width = 2.0 + 2.5 * columns if columns > 1 else 6.5
     figure, axes = new_figure(width, lines * (0.32 * len(rows) + 0.75) + 0.7, lines, columns, sharex=True, sharey=True)
-    names = list(dict.fromkeys(name for row in next(iter(panels.values())).values() for name in row))
+    names = list(dict.fromkeys(name for contenders in panels.values() for row in contenders.values() for name in row))
     shifts = np.linspace(-0.2, 0.2, len(names)) if len(names) > 1 else [0]
     for axis, (panel, contenders) in zip(axes.flat, panels.items(), strict=False):
         for place, row in enumerate(rows):
@@ -197,11 +197,13 @@ def plot_intervals(
                 outside = limits is not None and value < limits[0]
                 axis.plot(interval, [place + shift] * 2, color=color, lw=2, alpha=0.5)
                 axis.plot(limits[0] if outside else value, place + shift, "<" if outside else "o", color=color, ms=5)
-        axis.set(yticks=range(len(rows)), yticklabels=rows, ylim=(len(rows) - 0.5, -0.5), xlim=limits)
+        axis.set(yticks=range(len(rows)), yticklabels=rows, ylim=(len(rows) - 0.5, -0.5))
         axis.grid(axis="x", color="0.9")
         axis.set_title(panel, fontsize=9)
     for axis in axes[-1]:
         axis.set_xlabel(xlabel, fontsize=9)
+    if limits:  # and left alone without them: a limit that is set, if only to itself, no longer grows with later panels
+        axes[0, 0].set_xlim(limits)
     if len(names) > 1:
         handles = [
             axes[0, 0].plot([], [], "o", color=c)[0] for _, c in zip(names, itertools.cycle(COLORS), strict=False)

@@ -252,8 +252,9 @@ def evaluate_row(row: Row, folder: Path, worked: bool, executor: Executor | None
 def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
-    With seed 0 go those of the first round and of the world, if the row has its own. Seeds that are made elsewhere, in
-    a folder of their own, have V and M from another training by the same settings; which, their logs say.
+    With them go the records of the first round and of the world, if the row has its own. Seeds that are made elsewhere,
+    in a folder without seed 0, have V and M from another training by the same settings: the records of that one go to
+    `first_of_seed1` and `world_of_seed1`, by the first of these seeds.
     """
     kept = []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:
@@ -262,8 +263,9 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
     for part in ("first", "world"):
-        if target / name / "seed0" in kept and (Path(folder) / name / part).exists():
-            copy_records(Path(folder) / name / part, target / name / part)
+        if kept and (Path(folder) / name / part).exists():
+            own = part if kept[0].name == "seed0" else f"{part}_of_{kept[0].name}"
+            copy_records(Path(folder) / name / part, target / name / own)
     return kept
 
 
@@ -297,13 +299,22 @@ def stage_times(row: Path) -> dict[str, float]:
 
 
 def lost_points(folders: list[Path]) -> dict[str, float]:
-    """Where the points up to 1,000 went, mean of all episodes: {"time": 0.1 a frame, "tiles": all else}.
+    """Where the points up to 1,000 went, mean of all episodes: 1,000 less the sum of the parts is the mean return.
 
-    All else is the tiles not visited, and the 100 points for leaving the field.
+    Returns:
+        "speed": 0.1 for each frame of a lap, had every episode been a complete lap at the mean time of those that were.
+        "waiting": 0.1 for each frame more. A lap ends when all tiles are visited, so that one missed tile prolongs the
+        episode to its last frame. "tiles": those not visited, and the 100 points for leaving the field.
     """
     episodes = [episode for folder in folders for episode in load_json(folder / "evaluation.json")["episodes"]]
     returns, frames = (np.array([episode[name] for episode in episodes]) for name in ("return", "frames"))
-    return {"time": float(0.1 * frames.mean()), "tiles": float((1000 - returns - 0.1 * frames).mean())}
+    laps = frames[returns >= SOLVED]  # 1,000 frames at most, so 900 points at least; and with a tile missing, fewer
+    speed = laps.mean() if len(laps) else frames.mean()
+    return {
+        "speed": float(0.1 * speed),
+        "waiting": float(0.1 * (frames.mean() - speed)),
+        "tiles": float((1000 - returns - 0.1 * frames).mean()),
+    }
 
 
 def learning_curve(folder: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -348,31 +359,37 @@ def official_returns(folders: list[Path]) -> np.ndarray:
     return np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
 
 
-def bootstrap(returns: np.ndarray) -> list[float]:
-    """95% interval of the mean of returns (seeds, tracks), by a bootstrap of seeds and, within each, of tracks.
+def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
+    """95% interval of the mean of returns (seeds, tracks), by a bootstrap of the seeds and of the tracks.
 
-    All seeds drive the same tracks, but each drives them in its own way, so tracks are drawn anew for every seed
-    (a bootstrap in two stages; Agarwal et al., 2021, argue for bootstrap intervals where runs are few, and resample
-    the runs of each task). Three seeds are few: it is a rough one.
+    All seeds drive the same tracks, so a track is drawn for all of them together. (Agarwal et al., 2021, argue for
+    bootstrap intervals where runs are few.) From three seeds it is still too narrow: see `notebooks/05`, step 7.
     """
-    rng, (seeds, tracks) = np.random.default_rng(0), returns.shape
-    drawn = rng.integers(seeds, size=(RESAMPLES, seeds, 1))
-    means = returns[drawn, rng.integers(tracks, size=(RESAMPLES, seeds, tracks))].mean(axis=(1, 2))
+    means = resampled_means(returns, *draw_tracks(returns, resamples))
     return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
 
 
-def bootstrap_gain(before: np.ndarray, after: np.ndarray) -> list[float]:
+def bootstrap_gain(before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     """95% interval of the mean of `after` less the mean of `before`, both returns (seeds, tracks) on the same tracks.
 
     Seeds are drawn anew for each of the two, tracks once for both: a long track costs both of them time. Of a row with
     one seed the luck of its search is left out, so that the interval is too narrow.
     """
-    rng, gain = np.random.default_rng(0), 0.0
-    tracks = rng.integers(before.shape[1], size=(RESAMPLES, 1, before.shape[1]))
-    for sign, returns in ((-1, before), (1, after)):
-        seeds = rng.integers(len(returns), size=(RESAMPLES, len(returns), 1))
-        gain = gain + sign * returns[seeds, tracks].mean(axis=(1, 2))
-    return [float(bound) for bound in np.percentile(gain, [2.5, 97.5])]
+    rng, tracks = draw_tracks(before, resamples)
+    gains = resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks)
+    return [float(bound) for bound in np.percentile(gains, [2.5, 97.5])]
+
+
+def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generator, np.ndarray]:
+    """The Generator of a bootstrap, and the tracks of each resample, int (resamples, 1, tracks)."""
+    rng, tracks = np.random.default_rng(0), returns.shape[1]
+    return rng, rng.integers(tracks, size=(resamples, 1, tracks))
+
+
+def resampled_means(returns: np.ndarray, rng: np.random.Generator, tracks: np.ndarray) -> np.ndarray:
+    """The mean return of each resample, float64 (resamples,), with seeds drawn here."""
+    seeds = rng.integers(len(returns), size=(len(tracks), len(returns), 1))
+    return returns[seeds, tracks].mean(axis=(1, 2))
 
 
 def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:

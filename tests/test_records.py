@@ -72,7 +72,7 @@ def test_the_readme_s_rows_are_the_replication_s():
         planned = len(ROWS[name].seeds) if name in ROWS else 1
         seeds = f"{len(folders)}" + (f" of {planned}" if len(folders) < planned else "")
         low, high = found["interval"]
-        counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}"]
+        counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}", f"{found['frames'] / 1e6:.2f} M"]
         scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
         assert cells(f"`{name}`") == [seeds, *scores, *counts]
 

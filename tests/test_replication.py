@@ -14,7 +14,7 @@ from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import LOG, fitness_curves
 from stad_lab.pipeline import total_budget
-from stad_lab.plots import plot_curves, plot_episodes, plot_returns, plot_seeds, plot_stacks
+from stad_lab.plots import plot_curves, plot_episodes, plot_intervals, plot_returns, plot_seeds, plot_stacks
 from stad_lab.replication import (
     FLOORS,
     ROWS,
@@ -151,16 +151,20 @@ def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     ).read_bytes()
 
 
-def test_a_seed_that_was_made_elsewhere_joins_the_row_and_leaves_the_world_of_seed_0(table, tmp_path):
+def test_a_seed_that_was_made_elsewhere_joins_the_row_and_its_world_that_of_seed_0(table, tmp_path):
     folder, summaries = table
     for place, other in (("here", "seed1"), ("elsewhere", "seed0")):
         shutil.copytree(folder / "two", tmp_path / place / "two", ignore=shutil.ignore_patterns(other, "rollouts"))
-    save_json(tmp_path / "elsewhere" / "two" / "world" / "record.json", {"variant": "of another training"})
+    trained = {"variant": "of another training"}
+    save_json(tmp_path / "elsewhere" / "two" / "world" / "record.json", trained)
     kept = tmp_path / "kept"
     for place, seed in (("here", "seed0"), ("elsewhere", "seed1")):
         assert [path.name for path in keep("two", tmp_path / place, kept)] == [seed]
     assert summarise(kept_rows(kept)["two"]) == summaries["two"]
     assert load_json(kept / "two" / "world" / "record.json") == load_json(folder / "two" / "world" / "record.json")
+    assert load_json(kept / "two" / "world_of_seed1" / "record.json")["variant"] == trained["variant"]
+    first = [kept / "two" / place / "evolution.json" for place in ("first", "first_of_seed1")]
+    assert load_json(first[0]) == load_json(first[1])  # a copy here; another training's elsewhere
 
 
 def test_the_times_of_a_row_are_those_of_all_its_stages_in_both_rounds(table, tmp_path):
@@ -211,24 +215,23 @@ def test_the_interval_covers_the_truth_more_often_than_one_over_tracks_alone():
     rng, hits, narrow = np.random.default_rng(1), [], []
     for _ in range(40):
         returns = 900 + 15 * rng.standard_normal((5, 1)) + 60 * rng.standard_normal((5, 100))
-        low, high = bootstrap(returns)
+        low, high = bootstrap(returns, resamples=1000)
         hits.append(low < 900 < high)
         spread = 1.96 * returns.std() / np.sqrt(returns.size)
         narrow.append(abs(returns.mean() - 900) < spread)
     assert np.mean(hits) > 0.8 > np.mean(narrow)
 
 
-def test_the_interval_of_a_gain_shares_the_tracks_and_covers_the_luck_of_both_searches(monkeypatch):
-    monkeypatch.setattr(replication, "RESAMPLES", 1000)
+def test_the_interval_of_a_gain_shares_the_tracks_and_covers_the_luck_of_both_searches():
     rng, hits, narrow = np.random.default_rng(0), [], []
     tracks = 900 + 60 * rng.standard_normal(100)
     assert bootstrap_gain(tracks[None], tracks[None] + 5) == pytest.approx([5, 5])  # on every track
     for _ in range(40):
         lucks = 15 * rng.standard_normal((2, 5, 1)) + 10 * rng.standard_normal((2, 5, 100))
         before, after = tracks + lucks[0], tracks + 10 + lucks[1]
-        low, high = bootstrap_gain(before, after)
+        low, high = bootstrap_gain(before, after, resamples=1000)
         hits.append(low < 10 < high)
-        low, high = bootstrap_gain(before.mean(axis=0)[None], after.mean(axis=0)[None])
+        low, high = bootstrap_gain(before.mean(axis=0)[None], after.mean(axis=0)[None], resamples=1000)
         narrow.append(low < 10 < high)
     assert np.mean(hits) > 0.8 > 0.4 > np.mean(narrow)
 
@@ -274,12 +277,28 @@ def test_a_driver_that_does_not_look_is_a_row_like_any_other(tmp_path, monkeypat
     assert found["random_driver"]["mean"] != found["gentle_driver"]["mean"]
 
 
-def test_lost_points_and_the_mean_make_a_thousand(tmp_path):
-    episodes = [{"track": 0, "return": 890.0, "frames": 900}, {"track": 1, "return": -130.0, "frames": 300}]
-    save_json(tmp_path / "evaluation.json", {"episodes": episodes})
-    assert lost_points([tmp_path]) == {"time": 60.0, "tiles": pytest.approx((20 + 1100) / 2)}
-    figure = plot_stacks({"agent": lost_points([tmp_path])}, "Lost", "points")
-    assert figure.get_label() == "Lost. agent: time 60, tiles 560."
+def test_lost_points_tell_slow_laps_from_waiting_for_the_end_after_a_missed_tile(tmp_path):
+    drives = [(930.0, 700), (910.0, 900), (896.0, 1000), (-130.0, 300)]  # two laps, a missed tile, out of the field
+    save_json(tmp_path / "evaluation.json", {"episodes": [{"return": r, "frames": f} for r, f in drives]})
+    lost = lost_points([tmp_path])
+    assert lost == pytest.approx({"speed": 80.0, "waiting": 72.5 - 80.0, "tiles": (4 + 1100) / 4})
+    assert 1000 - sum(lost.values()) == pytest.approx(np.mean([episode for episode, _ in drives]))
+    figure = plot_stacks({"agent": {"speed": 80.0, "tiles": 276.0}}, "Lost", "points")
+    assert figure.get_label() == "Lost. agent: speed 80, tiles 276."
+
+
+def test_an_agent_without_a_complete_lap_has_its_time_as_speed(tmp_path):
+    save_json(tmp_path / "evaluation.json", {"episodes": [{"return": 500.0, "frames": 1000}]})
+    assert lost_points([tmp_path]) == {"speed": 100.0, "waiting": 0.0, "tiles": 400.0}
+
+
+def test_every_panel_of_intervals_shows_all_its_values():
+    panels = {"one": {"a": {"claimed": (75.0, [75.0, 75.0])}}, "two": {"a": {"here": (-20.0, [-30.0, -10.0])}}}
+    figure = plot_intervals(panels, "Gain", "points")
+    for axis in figure.axes:
+        low, high = axis.get_xlim()
+        assert low < -30 and high > 75
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["claimed", "here"]
 
 
 def test_every_row_that_we_report_holds_its_protocol():
