@@ -1,6 +1,5 @@
 """The table: one command makes a row and goes on with it, and its interval covers the truth."""
 
-import dataclasses
 import functools
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -82,6 +81,21 @@ def test_a_row_that_shares_a_world_trains_none_of_its_own(table):
     folder, _ = table
     assert {path.name for path in (folder / "blind").iterdir()} == {"seed3"}
     assert (folder / "one" / "world").is_dir() and not (folder / "one" / "seed0").exists()
+
+
+def test_every_seed_of_a_retrained_row_is_a_whole_run_of_its_own(table, tmp_path, monkeypatch):
+    monkeypatch.setitem(ROWS, "anew", Row("input", "whole runs", FIRST, seeds=(0, 1), retrained=True))
+    with ThreadPoolExecutor(1) as executor:
+        found = replicate("anew", tmp_path, executor)
+        assert replicate("anew", tmp_path, executor, seeds=[1])["seeds"] == found["seeds"][1:]
+    logs = [load_json(tmp_path / "anew" / f"seed{seed}" / LOG) for seed in (0, 1)]
+    assert logs[0]["autoencoder"] != logs[1]["autoencoder"]
+    first = load_json(table[0] / "two" / "first" / LOG)  # of seed 0, with the same settings
+    assert first["autoencoder"] == logs[0]["autoencoder"] and first["generations"] == logs[0]["generations"]
+    assert found["episodes"] == 8 + 8 + 2 and len(keep("anew", tmp_path, tmp_path / "kept")) == 2
+    monkeypatch.setattr(replication, "speeds", lambda *_: dict.fromkeys(("V, M, C", "official", "V", "M"), 100.0))
+    one, both = (forecast("anew", seeds) for seeds in ([0], [0, 1]))
+    assert both == {part: 2 * seconds for part, seconds in one.items()}
 
 
 def test_what_is_there_is_not_done_again(table):
@@ -310,7 +324,7 @@ def test_every_row_that_we_report_holds_its_protocol():
             assert [episode["track"] for episode in told["episodes"]] == list(range(100))
             assert record["made_with"]["uncommitted_changes"] is False
             if name in ROWS:
-                row = dataclasses.replace(ROWS[name].settings, evolution_seed=int(folder.name.removeprefix("seed")))
+                row = ROWS[name].settings_of(int(folder.name.removeprefix("seed")))
                 assert record["settings"] == row.as_dict() and told["renderer"] == "official"
                 assert told["controller_sha256"] == checksum((folder / "controller.safetensors").read_bytes())
                 if ROWS[name].base and (base := folder.parents[1] / ROWS[name].base / folder.name).exists():
