@@ -10,7 +10,8 @@ import pytest
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.checkpoints import load_json
-from stad_lab.replication import ROWS, kept_rows, stage_times, summarise
+from stad_lab.evolution import LOG
+from stad_lab.replication import ROWS, bootstrap, kept_rows, official_returns, stage_times, summarise
 from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
@@ -92,6 +93,27 @@ def test_the_readme_tells_how_agents_drive_with_the_fast_renderer_before_and_aft
             returns.append([episode["return"] for episode in found["episodes"]])
         told += [*(f"{mean:.1f}" for mean in np.mean(returns, axis=1)), f"{(np.array(returns) < 800).sum()}"]
     assert cells(f"`{variant}`, fast") == told
+
+
+def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
+    # The notebook itself asserts none of this: who adds seeds of their own may find otherwise.
+    rows = kept_rows()
+    returns = {name: official_returns(folders) for name, folders in rows.items()}
+    for recipe in ("two_rounds", "finished"):
+        means = {name: found.mean() for name, found in returns.items() if name.startswith(recipe)}
+        assert max(means, key=means.get) == f"{recipe}_frame"
+    assert returns["two_rounds_frame"].min() > 800
+    assert min(returns[name].mean(axis=1).min() for name in ("two_rounds_frame", "finished_input_output")) > 906
+    for name in ("paper_frame", "paper_input"):  # validation flatters by about a hundred points
+        best = load_json(rows[name][0] / LOG)["best"]["validation"]
+        assert 90 < best - returns[name][0].mean() < 110
+    fast = {}
+    for stage in ("two_rounds", "finished"):
+        for variant in VARIANTS:
+            found = [read(f"fast/{stage}/{variant}_{first}.json")["episodes"] for first in (0, 100)]
+            fast[stage, variant] = np.array([episode["return"] for part in found for episode in part])
+    assert 0 < fast["two_rounds", "output"].mean() - fast["two_rounds", "frame"].mean() < 1
+    assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
 
 
 def test_the_readme_s_times_are_those_of_whole_runs_and_keep_the_promise():
