@@ -320,7 +320,8 @@ def lost_points(folders: list[Path]) -> dict[str, float]:
     Returns:
         "speed": 0.1 for each frame of a lap, had every episode been a complete lap at the mean time of those that were.
         "waiting": 0.1 for each frame more. A lap ends when all tiles are visited, so that one missed tile prolongs the
-        episode to its last frame. "tiles": those not visited, and the 100 points for leaving the field.
+        episode to its last frame; only leaving the field shortens it. "tiles": those not visited, and the 100 points
+        for leaving the field.
     """
     episodes = [episode for folder in folders for episode in load_json(folder / "evaluation.json")["episodes"]]
     returns, frames = (np.array([episode[name] for episode in episodes]) for name in ("return", "frames"))
