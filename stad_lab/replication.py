@@ -379,8 +379,8 @@ def official_returns(folders: list[Path]) -> np.ndarray:
 def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     """95% interval of the mean of returns (seeds, tracks), by a bootstrap of the seeds and of the tracks.
 
-    All seeds drive the same tracks, so a track is drawn for all of them together. (Agarwal et al., 2021, argue for
-    bootstrap intervals where runs are few.) From three seeds it is still too narrow: see `notebooks/05`, step 7.
+    All seeds drive the same tracks, so a track is drawn for all of them together. From three seeds the
+    interval is still too narrow (notebook 05, step 7). Agarwal et al., 2021, argue for bootstraps where runs are few.
     """
     means = resampled_means(returns, *draw_tracks(returns, resamples))
     return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
