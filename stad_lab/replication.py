@@ -94,11 +94,11 @@ def make_rows() -> dict[str, Row]:
     second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5)
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
-    # 15 x 256 + 3 x 16 episodes more, and 480 agents: 8,594 episodes and 4,000 agents in all.
-    finished = dataclasses.replace(second, **FINISH)
     # Before the ceiling: 900 + 15 x 64 + 3 x 16 = 1,908 episodes.
     for variant in VARIANTS:
         rows[f"early_{variant}"] = Row(variant, "the first round of our recipe", first, seeds=EARLY, retrained=True)
+    # 15 x 256 + 3 x 16 episodes more, and 480 agents: 8,594 episodes and 4,000 agents in all.
+    finished = dataclasses.replace(second, **FINISH)
     for variant in VARIANTS:
         base = f"two_rounds_{variant}"
         rows[f"finished_{variant}"] = Row(variant, "our recipe and a finish", finished, base=base)
@@ -161,17 +161,17 @@ def replicate(
     if name in FLOORS:
         return drive_floor(name, Path(folder) / name / "seed0", executor)
     row, folder = find_row(name, seeds), Path(folder)
+    folders = {seed: folder / name / f"seed{seed}" for seed in row.seeds}
     if row.base:
-        return finish_row(name, row, folder, executor)
-    if row.retrained:
-        for seed in row.seeds:
-            own = folder / name / f"seed{seed}"
+        finish_row(row, folder, folders, executor)
+    elif row.retrained:
+        for seed, own in folders.items():
             evaluate_row(row, own, train(row.variant, row.settings_of(seed), own, executor=executor), executor)
-        return summarise([folder / name / f"seed{seed}" for seed in row.seeds])
-    first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
-    for seed in row.seeds:
-        search(row, seed, folder / name / f"seed{seed}", first, world, executor)
-    return summarise([folder / name / f"seed{seed}" for seed in row.seeds])
+    else:
+        first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
+        for seed, own in folders.items():
+            search(row, seed, own, first, world, executor)
+    return summarise(list(folders.values()))
 
 
 def find_row(name: str, seeds: Sequence[int] | None = None) -> Row:
@@ -221,17 +221,16 @@ def drive_blindly(name: str, track: int) -> tuple[float, int]:
     return total, frames
 
 
-def finish_row(name: str, row: Row, folder: Path, executor: Executor | None) -> dict:
-    """Make a row of finishes, and those seeds of its base that are not there; returns as `replicate`."""
-    for seed in row.seeds:
-        base, own = (folder / part / f"seed{seed}" for part in (row.base, name))
+def finish_row(row: Row, folder: Path, folders: dict[int, Path], executor: Executor | None) -> None:
+    """Make the finishes of a row, seed -> folder, and those seeds of its base that are not there."""
+    for seed, own in folders.items():
+        base = folder / row.base / own.name
         if not (base / "evaluation.json").exists():
             replicate(row.base, folder, executor, [seed])
         searches = [one.settings_of(seed) for one in (ROWS[row.base], row)]
         check_same_run(base, load_json(base / "record.json")["settings"], searches[0].as_dict())
         worked = finish(row.variant, searches[1], base, own, executor)
         evaluate_row(row, own, worked, executor)
-    return summarise([folder / name / f"seed{seed}" for seed in row.seeds])
 
 
 def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path | None, Path]:
@@ -425,7 +424,8 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
         return times | {"finishes": times["searches"] * longer, "evaluations": 2 * times["evaluations"]}
     with tempfile.TemporaryDirectory() as folder:
         speed = speeds(row, Path(folder))
-    rounds = [row.first, row.settings] if row.first else [row.settings] * (len(row.seeds) if row.retrained else 1)
+    runs = len(row.seeds) if row.retrained else 1
+    rounds = [row.first, row.settings] if row.first else [row.settings] * runs
     return {
         "rollouts": sum(s.episodes * s.episode_frames + s.agent_episodes * s.max_frames for s in rounds)
         / speed["V, M, C"],

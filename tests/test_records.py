@@ -1,5 +1,6 @@
 """The records of measurements: the README says what they say."""
 
+import itertools
 import json
 import re
 from pathlib import Path
@@ -21,6 +22,15 @@ CLUSTER = (Path(__file__).parent.parent / "docs" / "cluster.md").read_text()
 
 def read(name):
     return json.loads((RECORDS / name).read_text())
+
+
+def fast_drives(stage, variant):
+    """What an agent drove with the fast renderer on two hundred tracks, as two evaluations."""
+    return [read(f"fast/{stage}/{variant}_{first}.json") for first in (0, 100)]
+
+
+def returns_of(evaluation):
+    return np.array([episode["return"] for episode in evaluation["episodes"]])
 
 
 def cells(label, page=README):
@@ -84,14 +94,13 @@ def test_the_readme_tells_how_agents_drive_with_the_fast_renderer_before_and_aft
     agents = {"two_rounds": RECORDS / "table" / row / "seed0", "finished": PRETRAINED / "second_round" / variant}
     told = []
     for stage, folder in agents.items():
-        returns = []
-        for first in (0, 100):
-            found = read(f"fast/{stage}/{variant}_{first}.json")
+        drives = fast_drives(stage, variant)
+        for first, found in zip((0, 100), drives, strict=True):
             assert [episode["track"] for episode in found["episodes"]] == list(range(first, first + 100))
             assert found["renderer"] == "fast"
             assert found["controller_sha256"] == load_json(folder / "evaluation.json")["controller_sha256"]
-            returns.append([episode["return"] for episode in found["episodes"]])
-        told += [*(f"{mean:.1f}" for mean in np.mean(returns, axis=1)), f"{(np.array(returns) < 800).sum()}"]
+        returns = np.array([returns_of(found) for found in drives])
+        told += [*(f"{mean:.1f}" for mean in returns.mean(axis=1)), f"{(returns < 800).sum()}"]
     assert cells(f"`{variant}`, fast") == told
 
 
@@ -103,20 +112,13 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
         means = {name: found.mean() for name, found in returns.items() if name.startswith(recipe)}
         assert max(means, key=means.get) == f"{recipe}_frame"
     assert returns["two_rounds_frame"].min() > 800
-    assert (
-        min(
-            returns[name].mean(axis=1).min() for name in ("two_rounds_frame", "finished_frame", "finished_input_output")
-        )
-        > 906
-    )
+    for name in ("two_rounds_frame", "finished_frame", "finished_input_output"):
+        assert returns[name].mean(axis=1).min() > 906
     for name in ("paper_frame", "paper_input"):  # validation flatters by about a hundred points
         best = load_json(rows[name][0] / LOG)["best"]["validation"]
         assert 90 < best - returns[name][0].mean() < 110
-    fast = {}
-    for stage in ("two_rounds", "finished"):
-        for variant in VARIANTS:
-            found = [read(f"fast/{stage}/{variant}_{first}.json")["episodes"] for first in (0, 100)]
-            fast[stage, variant] = np.array([episode["return"] for part in found for episode in part])
+    stages = itertools.product(("two_rounds", "finished"), VARIANTS)
+    fast = {pair: np.concatenate([returns_of(found) for found in fast_drives(*pair)]) for pair in stages}
     assert 0 < fast["two_rounds", "output"].mean() - fast["two_rounds", "frame"].mean() < 1
     assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
 
