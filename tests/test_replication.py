@@ -330,4 +330,5 @@ def test_every_row_that_we_report_holds_its_protocol():
                 if ROWS[name].base and (base := folder.parents[1] / ROWS[name].base / folder.name).exists():
                     assert record["earlier"] == load_json(base / "record.json")
                 spent, more = total_budget(record), name.startswith(("paper", "finished"))
-                assert spent["agents"] <= 4800 and (spent["episodes"] <= 4800 or more)
+                if name != "long_input":  # which asks what more would bring
+                    assert spent["agents"] <= 4800 and (spent["episodes"] <= 4800 or more)
