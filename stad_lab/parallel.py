@@ -55,6 +55,7 @@ class WorkerProcesses(Executor):
         self.losses, self.unfinished, self.last_sign = 0, 0, time.monotonic()
         self.peak_memory = 0.0  # MB, of the largest process that was alive at the end
         self.pool = self._new_pool()
+        self.lost: list[ProcessPoolExecutor] = []  # kept, because one that goes wants the lock that it breaks under
         threading.Thread(target=self._watch, daemon=True).start()
 
     def submit(self, function: Callable, /, *arguments, **named) -> Future:
@@ -89,13 +90,13 @@ class WorkerProcesses(Executor):
         return ProcessPoolExecutor(self.count, mp_context=context, initializer=start_worker)
 
     def _begin(self, task: Future, work: Callable) -> None:
-        with self.lock:
-            pool = self.pool
-            try:
-                attempt = pool.submit(work)
-            except BrokenProcessPool as error:  # it broke a moment ago
-                attempt = Future()
-                attempt.set_exception(error)
+        pool = self.pool
+        try:
+            # Without our lock: a pool that breaks calls `_end` while it holds its own, which this wants (Python 3.12).
+            attempt = pool.submit(work)
+        except BrokenProcessPool as error:  # it broke a moment ago
+            attempt = Future()
+            attempt.set_exception(error)
         attempt.add_done_callback(functools.partial(self._end, task, work, pool))
 
     def _end(self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future) -> None:
@@ -120,6 +121,7 @@ class WorkerProcesses(Executor):
                 if self.losses > LOSSES:
                     return False
                 print("a worker process was lost: starting new ones, which do its work again", file=sys.stderr)
+                self.lost.append(lost)
                 self.pool, self.last_sign = self._new_pool(), time.monotonic()
             return True
 

@@ -47,10 +47,12 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
 
     Raises:
         FileNotFoundError: no run in the folder, since it has no record.
-        ValueError: the record itself is damaged.
+        ValueError: the record itself is damaged, or of a driver without V, M and C.
     """
     folder = Path(folder)
     record = load_json(folder / "record.json", EARLIER)
+    if "settings" not in record:
+        raise ValueError(f"{folder} is of {record['variant']}, which has no V, M and C: there is nothing to verify")
     variant, settings = record["variant"], Settings.from_dict(record["settings"])
     read_rollouts = functools.cache(Rollouts)  # it checks every block, and a dataset may have 12 GB: once is enough
     checks: dict[str, Callable[[], str]] = {

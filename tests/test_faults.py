@@ -24,6 +24,7 @@ from stad_lab.evolution import evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import TaskError, run_tasks, worker_processes
 from stad_lab.pipeline import STAGES, train
+from stad_lab.replication import RECORDS
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
 from stad_lab.verify import verify
@@ -311,8 +312,8 @@ def always_die():
 
 def test_work_of_a_killed_worker_is_done_again(tmp_path, capfd):
     with worker_processes(2) as executor:
-        tasks = [(tmp_path / "marker", number) for number in range(6)]
-        assert dict(run_tasks(executor, die_once, tasks)) == {number: number for number in range(6)}
+        tasks = [(tmp_path / "marker", number) for number in range(600)]  # many: it dies while others are handed in
+        assert dict(run_tasks(executor, die_once, tasks)) == {number: number for number in range(600)}
     assert "a worker process was lost: starting new ones" in capfd.readouterr().err
 
 
@@ -324,10 +325,9 @@ def test_work_of_a_stuck_worker_is_done_again(tmp_path, capfd):
     assert "they are stuck" in capfd.readouterr().err
 
 
-@pytest.mark.long
 def test_work_that_kills_every_worker_ends_in_an_error():
     with worker_processes(1) as executor, pytest.raises((TaskError, BrokenProcessPool)):
-        list(run_tasks(executor, always_die, [()]))
+        list(run_tasks(executor, always_die, [()] * 300))
 
 
 def test_an_executor_that_never_answers_ends_in_an_error(tmp_path):
@@ -468,6 +468,11 @@ def test_verify_finds_a_return_that_no_drive_gives(quick_run, tmp_path, in_this_
     save_json(folder / "record.json", record)
     drives = verify(folder, in_this_process)["drives"]
     assert re.match(r"differs: .*; but processor is '.*' and was 'a processor with", drives)
+
+
+def test_verify_says_of_a_driver_without_an_agent_that_there_is_nothing_to_verify(capsys):
+    assert main(["verify", str(RECORDS / "random_driver" / "seed0")]) == 2
+    assert "random_driver, which has no V, M and C: there is nothing to verify" in capsys.readouterr().err
 
 
 # Security
