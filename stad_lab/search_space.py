@@ -25,7 +25,7 @@ from stad_lab.settings import Settings
 
 START = "start.safetensors"
 COMPONENTS = "components.safetensors"
-MAKE_AGAIN = "delete it and run the same command again, which makes it again"
+MAKE_AGAIN = "run the same command again, which makes it again"
 
 
 @dataclass(frozen=True)

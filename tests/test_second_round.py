@@ -63,6 +63,17 @@ def test_a_second_round_asks_for_the_room_that_its_two_kinds_of_episodes_may_tak
     assert asked == pytest.approx(frames * (64 * 64 * 3 + 12) / 1e9, rel=1e-3)
 
 
+def test_a_second_round_that_would_see_the_bar_otherwise_is_refused_before_any_work(second, quick_run, tmp_path):
+    other = dataclasses.replace(SETTINGS, crop_bar=not SETTINGS.crop_bar)
+    with pytest.raises(ValueError, match=f"crop_bar={other.crop_bar}, but the run in .* has {SETTINGS.crop_bar}"):
+        collect_again(VARIANT, other, quick_run, tmp_path / "rollouts")
+    assert not (tmp_path / "rollouts").exists()
+    folder = shutil.copytree(second, tmp_path / "run")
+    (folder / "start.safetensors").unlink()
+    with pytest.raises(ValueError, match="crop_bar"):
+        carry_over(VARIANT, other, quick_run, folder / "rollouts", folder)
+
+
 def test_an_unsteady_hand_differs_between_episodes_and_m_remembers_what_was_done(agent, quick_run):
     frames, actions, _ = drive_noisily(agent, SETTINGS, 0)
     seen = features(read_world_model(quick_run, VARIANT), frames, actions)[-1]
@@ -148,8 +159,11 @@ def test_an_evolution_without_its_start_is_refused_and_the_command_makes_it_agai
     folder = shutil.copytree(second, tmp_path / "run")
     before = load_file(folder / "start.safetensors")
     (folder / "start.safetensors").write_bytes(b"cut")
-    with pytest.raises(ValueError, match=r"start.safetensors is damaged.*delete it and run the same command again"):
+    with pytest.raises(
+        ValueError, match=r"start.safetensors is damaged.*delete it and run the same command again"
+    ) as error:
         train(VARIANT, SETTINGS, folder, earlier=quick_run)
+    assert str(error.value).count("delete it") == 1
     (folder / "start.safetensors").unlink()
     train(VARIANT, SETTINGS, folder, earlier=quick_run)
     assert np.array_equal(load_file(folder / "start.safetensors")["parameters"], before["parameters"])
