@@ -113,7 +113,10 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument("--fast", action="store_true", help="draw with the fast renderer (not for reports)")
     command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
     command.add_argument(
-        "--json", type=Path, help="where to write the result; default evaluation-VARIANT.json in the run, or here"
+        "--json",
+        type=Path,
+        help="where to write the result; default evaluation-VARIANT.json in the run, or here, and with -fast or"
+        " -from-TRACK in its name what is not the official evaluation",
     )
 
     command = commands.add_parser(
@@ -238,7 +241,8 @@ def main(arguments: list[str] | None = None) -> int:
                 if not finish(options.variant, settings, earlier, options.out, executor):
                     print(f"the finish is there in {options.out}: nothing to do")
         elif options.command == "evaluate":
-            file = options.json or (options.path or Path()) / f"evaluation-{options.variant}.json"
+            other = "-fast" * options.fast + f"-from-{options.first_track}" * (options.first_track > 0)
+            file = options.json or (options.path or Path()) / f"evaluation-{options.variant}{other}.json"
             chosen = (options.variant, options.path, options.episodes, options.first_track, options.fast)
             load_agent(*chosen[:2])
             check_writable(file)
@@ -261,8 +265,9 @@ def main(arguments: list[str] | None = None) -> int:
             settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
             file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)
             check_writable(file)
-            before = load_json(file) if file.exists() else {}
-            save_json(file, before | study(settings, rollouts, options.out, parts))
+            for part in parts:  # each is kept as soon as it is measured
+                found = study(settings, rollouts, options.out, [part])
+                save_json(file, (load_json(file) if file.exists() else {}) | found)
             print(f"every measurement: {file}")
         elif options.command == "benchmark":
             check_writable(options.json)

@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 
 from stad_lab.agent import load_agent, run_folder
 from stad_lab.checkpoints import checksum
-from stad_lab.evolution import drive_group, hand_out
+from stad_lab.evolution import CONTROLLER, drive_group, hand_out
 from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.rollouts import TRACK_RANGES
 
@@ -57,6 +57,7 @@ def evaluate(
         )
     agent = load_agent(variant, path)
     folder = run_folder(variant, path)
+    driven = checksum((folder / CONTROLLER).read_bytes())  # now, since a search may find a better one meanwhile
     begin = time.perf_counter()
     tracks = list(range(first_track, first_track + episodes))
     with worker_processes(processes, executor) as executor:
@@ -69,7 +70,7 @@ def evaluate(
     return {
         "variant": variant,
         "renderer": "fast" if fast else "official",
-        "controller_sha256": checksum((folder / "controller.safetensors").read_bytes()),
+        "controller_sha256": driven,
         **report(tracks, returns, frames),
         "seconds": time.perf_counter() - begin,
     }

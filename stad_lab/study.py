@@ -19,7 +19,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model
-from stad_lab.autoencoder import VARIANTS, AutoEncoder, kl_divergence, load_autoencoder
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, check_facts, kl_divergence, load_autoencoder
 from stad_lab.drives import (
     MOTION,
     Drive,
@@ -30,7 +30,7 @@ from stad_lab.drives import (
     road_in_sight,
 )
 from stad_lab.frames import earlier_frames
-from stad_lab.mdn_rnn import MDNRNN, encode_rollouts, fit_mdn_rnn, load_mdn_rnn
+from stad_lab.mdn_rnn import MDNRNN, check_partner, encode_rollouts, fit_mdn_rnn, load_mdn_rnn
 from stad_lab.parallel import worker_processes
 from stad_lab.pipeline import provenance, train
 from stad_lab.probe import probe
@@ -293,6 +293,7 @@ def lesser_forecasts(
 ) -> dict[str, np.ndarray]:
     """NLL of M's that lack something, trained like the whole one on the same data."""
     rollouts, encoded, result = Rollouts(rollouts_folder), None, {}
+    identity = world_model.identities["autoencoder"]
     for name, (changes, sees_actions) in CONTENDERS.items():
         path = work / name.replace(" ", "_") / "mdn_rnn.safetensors"
         lesser = dataclasses.replace(settings, **changes)
@@ -301,9 +302,10 @@ def lesser_forecasts(
             torch.manual_seed(settings.seed)
             mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures)
             shown = [action * sees_actions for action in rollouts.actions]
-            identity = world_model.identities["autoencoder"]
             fit_mdn_rnn(path, mdn_rnn, "input", identity, encoded, shown, rollouts, lesser)
-        mdn_rnn, _ = load_mdn_rnn(path, "input")
+        mdn_rnn, facts = load_mdn_rnn(path, "input")
+        check_facts(path, facts, lesser)
+        check_partner(path, facts, autoencoder=identity)
         if lesser.m_sequence > 1:
             result[name] = mixture_nll(forecast(mdn_rnn, z, actions * sees_actions), z)
         else:

@@ -1,11 +1,13 @@
 """Evaluation: official tracks, every episode on record, numbers that a script of one's own finds again."""
 
+import shutil
+
 import gymnasium
 import numpy as np
 import pytest
 
 from stad_lab import load_agent
-from stad_lab.checkpoints import load_json
+from stad_lab.checkpoints import checksum, load_json
 from stad_lab.evaluation import describe, evaluate, summarise
 from stad_lab.rollouts import TRACK_RANGES
 
@@ -49,15 +51,33 @@ def test_every_episode_is_on_record(fast):
     assert (fast["variant"], fast["renderer"]) == ("input_output", "fast")
 
 
-def test_an_evaluation_goes_to_the_screen_and_to_a_file(straight_run, fast, tmp_path, command_line):
-    arguments = ["evaluate", "--variant", "input_output", "--path", straight_run, "--fast", "--episodes", 2]
-    process = command_line(*arguments, "--first-track", 10, "--processes", 1, "--json", tmp_path / "result.json")
+def test_an_evaluation_goes_to_the_screen_and_to_a_file_that_is_not_the_official_one_s(
+    straight_run, fast, tmp_path, command_line
+):
+    run = shutil.copytree(straight_run, tmp_path / "run")
+    arguments = ["evaluate", "--variant", "input_output", "--path", run, "--fast", "--episodes", 2]
+    process = command_line(*arguments, "--first-track", 10, "--processes", 1)
     assert process.returncode == 0, process.stderr
-    result = load_json(tmp_path / "result.json")
+    file = run / "evaluation-input_output-fast-from-10.json"
+    result = load_json(file)
     assert result | {"seconds": 0} == fast | {"seconds": 0}  # one process or two: the same numbers
     assert result["seconds"] > 0
     assert describe(fast) in process.stdout
-    assert str(tmp_path / "result.json") in process.stdout
+    assert str(file) in process.stdout
+
+
+def test_a_result_names_the_controller_that_drove_if_a_search_finds_a_better_one_meanwhile(
+    straight_run, tmp_path, monkeypatch
+):
+    run = shutil.copytree(straight_run, tmp_path / "run")
+    drove = (run / "controller.safetensors").read_bytes()
+
+    def find_a_better_one(*given):
+        (run / "controller.safetensors").write_bytes(b"another")
+        return [(0, (np.array([1.0]), np.array([7])))]
+
+    monkeypatch.setattr("stad_lab.evaluation.run_tasks", find_a_better_one)
+    assert evaluate("input_output", run, episodes=1)["controller_sha256"] == checksum(drove)
 
 
 def test_the_screen_shows_what_the_summary_says(fast):

@@ -63,6 +63,27 @@ def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_
     assert not list(measured.glob("*/*.training.safetensors"))
 
 
+def test_an_m_of_another_v_or_size_is_not_taken_for_one_of_this_study(measured, quick_run):
+    world_model = read_world_model(PRETRAINED / "input", "input")
+    rollouts, nothing = quick_run / "rollouts", np.zeros((4, 20, 32), np.float32)
+    another = world_model._replace(identities=world_model.identities | {"autoencoder": "another"})
+    with pytest.raises(ValueError, match=r"mdn_rnn\.safetensors was made with another autoencoder"):
+        lesser_forecasts(Settings.preset("quick"), rollouts, measured, another, nothing, nothing)
+    with pytest.raises(ValueError, match="hidden_size"):
+        lesser_forecasts(Settings.preset("quick", hidden_size=9), rollouts, measured, world_model, nothing, nothing)
+
+
+def test_a_part_that_is_measured_is_kept_if_the_next_is_interrupted(tmp_path, monkeypatch):
+    def stop(*given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stad_lab.study.PARTS", {"autoencoder": lambda *given: {"found": 1}, "probe": stop})
+    monkeypatch.setattr("stad_lab.study.random_drives", lambda *given: [])
+    arguments = ["--settings", "quick", "--out", tmp_path, "--part", "autoencoder", "--part", "probe"]
+    assert main(["study", *map(str, arguments)]) == 130
+    assert load_json(tmp_path / "study.json")["autoencoder"]["found"] == 1
+
+
 def test_an_unknown_part_is_refused_before_any_work(tmp_path):
     with pytest.raises(ValueError, match="unknown part 'probes': choose from probe, autoencoder, mdn_rnn"):
         study(Settings.preset("quick"), tmp_path / "rollouts", tmp_path, ["probes"])
