@@ -107,7 +107,10 @@ def run_generation(
     variant: str,
     settings: Settings,
 ) -> dict:
-    """Ask for a population, let it drive, and tell its fitness; adds to the means, returns the log's entry."""
+    """Ask for a population, let it drive, and tell its fitness; adds to the means, returns the log's entry.
+
+    Its "sigma" is the step size that CMA-ES would take next, which `settings.sigma_decay` overrules (see `ask`).
+    """
     population = ask(strategy, settings, len(earlier))
     entry = drive_generation(executor, source, variant, settings, earlier, space.expand(population))
     strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
@@ -217,7 +220,11 @@ def keep_controller(variant: str, folder: Path, log: dict, controller: np.ndarra
 
 
 def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStrategy":
-    """pycma's strategy with a random source of its own, so that nothing else can disturb it."""
+    """pycma's strategy with a Generator of its own, so that nothing else can disturb it.
+
+    NumPy fills up a seed with zeros: with evolution_seed 0 its numbers are those of the random driver's fourth episode.
+    They are used for such different things that nothing follows from it.
+    """
     import cma  # here, because it takes two seconds, and the workers that drive have no use for it
 
     rng = np.random.default_rng([settings.seed, 3, settings.evolution_seed])

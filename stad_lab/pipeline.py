@@ -10,7 +10,8 @@ The folder of a run::
     components.safetensors        where C is searched, with `Settings.components`
     start.safetensors             only in a second round or a finish: the earlier run's C, for the V and M here
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
-                                  stage, and the most memory that a process has held by its end (in MB, for each start)
+                                  stage, and the most memory that a process has held by its end (in MB, for each start);
+                                  the time that a killed or failed start took is missing
 """
 
 import importlib.metadata
@@ -126,8 +127,9 @@ def run_stages(
                 save_json(folder / "record.json", record)
         print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
         worked |= did
-    if worked or "budget" not in record:
-        record["budget"] = budget(Settings.from_dict(record["settings"]), folder, rollouts_folder)
+    spent = budget(Settings.from_dict(record["settings"]), folder, rollouts_folder)
+    if worked or spent != record.get("budget"):  # a kill may have come between the last generation and this line
+        record["budget"] = spent
         save_json(folder / "record.json", record)
     return worked
 
@@ -136,6 +138,8 @@ def open_record(
     folder: Path, variant: str, settings: Settings, command: str, earlier: str | Path | None = None
 ) -> dict:
     """The record of the run in `folder`, or a new one; that of a second round or a finish holds the earlier run's.
+
+    What it was "made_with" stays that of the first start; a later one by other means adds to "continued_with".
 
     Raises:
         ValueError: the folder holds a run of another variant or of other settings.
@@ -156,6 +160,9 @@ def open_record(
     check_same_run(
         path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
     )
+    made, starts = provenance(command), [record["made_with"], *record.get("continued_with", [])]
+    if made != starts[-1]:
+        record["continued_with"] = [*starts[1:], made]
     return record | {"settings": settings.as_dict()}
 
 

@@ -14,6 +14,7 @@ from PIL import Image, ImageSequence
 from stad_lab.__main__ import main, read_changes
 from stad_lab.agent import save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, save_autoencoder
+from stad_lab.checkpoints import load_json, save_json
 from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
 from stad_lab.pipeline import command_of
 from stad_lab.settings import PRESETS, Settings
@@ -92,6 +93,17 @@ def test_the_second_run_of_a_command_does_nothing_and_says_so(run, command_line)
     assert after.keys() == before.keys()
     assert [name for name in after if after[name][0] != before[name][0]] == []
     assert [name for name in after if after[name][1] != before[name][1]] == []
+
+
+def test_a_budget_that_a_kill_left_behind_is_counted_again_and_a_later_start_by_other_means_is_told(run, capsys):
+    whole = load_json(run / "record.json")
+    old = whole["made_with"] | {"commit": "an earlier one"}
+    save_json(run / "record.json", whole | {"budget": {"random": whole["budget"]["random"]}, "made_with": old})
+    for _ in range(2):
+        assert main([str(argument) for argument in train_quickly(run)]) == 0
+        record = load_json(run / "record.json")
+        assert record["budget"] == whole["budget"] and record["seconds"] == whole["seconds"]
+        assert record["made_with"] == old and record["continued_with"] == [whole["made_with"]]
 
 
 @pytest.mark.parametrize(
