@@ -177,7 +177,7 @@ def check_settings() -> Iterator[Line]:
 
 def check_weights() -> Iterator[Line]:
     """The trained weights that come with stad_lab."""
-    files = sorted(Path(__file__).with_name("pretrained").glob("*/*.safetensors"))
+    files = sorted(Path(__file__).with_name("pretrained").rglob("*.safetensors"))
     small = [file.name for file in files if file.stat().st_size < 5000]  # a pointer of Git LFS, or half a download
     if not files or small:
         found = f"truncated: {', '.join(small)}" if small else "none in stad_lab/pretrained"

@@ -428,13 +428,14 @@ def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figu
     Args:
         runs: name -> (seeds, 3, generations), for each seed what `evolution.fitness_curves` makes. A line is the mean
             over the seeds, its band goes from the lowest to the highest.
-        window: generations of the running mean, which lets a line be seen through the noise.
+        window: generations of the running mean, which lets a line be seen through the noise; all of a shorter run.
     """
     figure, axes = new_figure(11.0, 3.9, 1, 3, sharey=True)
     for panel, (axis, name) in enumerate(zip(axes[0], ("worst", "average", "best"), strict=True)):
         for (label, curves), (color, dash) in zip(runs.items(), itertools.cycle(STYLES), strict=False):
-            smooth = np.apply_along_axis(np.convolve, 1, curves[:, panel], np.full(window, 1 / window), "valid")
-            generation = np.arange(smooth.shape[1]) + (window + 1) / 2
+            width = min(window, curves.shape[2])
+            smooth = np.apply_along_axis(np.convolve, 1, curves[:, panel], np.full(width, 1 / width), "valid")
+            generation = np.arange(smooth.shape[1]) + (width + 1) / 2
             axis.plot(generation, smooth.mean(axis=0), dash, color=color, lw=1.6, label=label)
             axis.fill_between(generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.2, lw=0)
         axis.axhline(900, color="grey", lw=0.8, ls=":")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stad_lab import check_environment, environment
+from stad_lab.agent import PRETRAINED
 
 ROOT = Path(__file__).parent.parent
 
@@ -96,6 +97,15 @@ def test_a_working_folder_that_is_missing_or_read_only_is_red(tmp_path, monkeypa
 def test_little_room_is_amber_and_none_is_red():
     states = [environment.graded("free disk", found, amber=3, red=1, remedy="make room").state for found in (4, 2, 0.5)]
     assert states == ["green", "amber", "red"]
+
+
+def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):
+    assert next(environment.check_weights()).found.startswith(f"{len(list(PRETRAINED.rglob('*.safetensors')))} files")
+    cut = tmp_path / "pretrained" / "second_round" / "frame" / "mdn_rnn.safetensors"
+    cut.parent.mkdir(parents=True)
+    cut.write_bytes(b"version https://git-lfs.github.com/spec/v1")
+    monkeypatch.setattr(environment, "__file__", str(tmp_path / "environment.py"))
+    assert next(environment.check_weights()).state == "red"
 
 
 def test_an_unknown_preset_is_red_and_names_the_presets(monkeypatch):

@@ -153,6 +153,11 @@ def test_a_band_goes_from_the_lowest_to_the_highest_seed(table):
         assert axis.lines[0].get_ydata() == pytest.approx(smooth.mean(axis=0))
 
 
+def test_a_run_shorter_than_the_window_is_drawn_at_its_mean():
+    figure = plot_seeds({"short": np.full((2, 3, 4), 100.0)}, "Evolution")
+    assert [axis.lines[0].get_ydata().tolist() for axis in figure.axes] == [[100.0]] * 3
+
+
 def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     folder, summaries = table
     kept = keep("two", folder, tmp_path)
