@@ -136,6 +136,7 @@ def moments():
                 if cell_grading["grade"]:
                     found[name[:2], cell_grading["grade_id"]] = dict(names), cell["source"]
                 exec(cell["source"], names)
+            found[name[:2], "the end"] = names, ""
     return found
 
 
@@ -160,6 +161,23 @@ WRONG = [
         "differences-start",
         "differences = lambda film, k: np.zeros(film.shape)",
         "dtype float64: expected float32",
+    ),
+    ("01", "differences-start", "differences = lambda film, k: episode_differences(film, 4)", "stride is not used"),
+    (
+        "01",
+        "find-motion-made-up",
+        "def find_motion(x, earlier, turns, forwards):\n"
+        "    wrap = {(t, f): np.abs(move(earlier, t, f)[:48] - x[:48]).mean() for t in turns for f in forwards}\n"
+        "    return min(wrap, key=wrap.get)",
+        "3 - 5 is 254",
+    ),
+    (
+        "01",
+        "find-motion-made-up",
+        "def find_motion(x, earlier, turns, forwards):\n"
+        "    wrap = {(t, f): np.abs(x[:48] - move(earlier, t, f)[:48]).mean() for t in turns for f in forwards}\n"
+        "    return min(wrap, key=wrap.get)",
+        "3 - 5 is 254",
     ),
     (
         "01",
@@ -209,6 +227,12 @@ WRONG = [
     ),
     ("02", "active-check", "active = lambda kl: np.flatnonzero(kl.mean(0) > 0.05)", "order of the numbers"),
     ("02", "active-check", "active = lambda kl: kl.mean(0) > 0.05", "numbers of those"),
+    (
+        "02",
+        "active-check",
+        "solved = active\nactive = lambda kl, threshold=0.05: solved(kl)",
+        "threshold is not used",
+    ),
     ("02", "silence-check", "def silence(z, latents): z[:, latents] = 0; return z", "changed the z"),
     ("02", "silence-check", "def silence(z, latents): z = z.clone(); z[[1]] = 0; return z", "you silenced pictures"),
     (
@@ -298,6 +322,14 @@ WRONG = [
         "    return np.percentile([horizon(d, constant) for d in drawn], [2.5, 97.5])",
         "steps of one drive belong together",
     ),
+    (
+        "03",
+        "horizon-interval-check",
+        "def horizon_interval(dream, constant, rng):\n"
+        "    drawn = rng.integers(15, size=(2000, 15))\n"
+        "    return np.percentile([horizon(dream[rows], constant[rows]) for rows in drawn], [5, 95])",
+        "90% interval",
+    ),
     ("04", "weights-check", "weights = lambda n: np.log(n // 2 + 0.5) - np.log(np.arange(1, n // 2 + 1))", "sum to 1"),
     (
         "04",
@@ -323,6 +355,12 @@ WRONG = [
         "ablate-check",
         "def ablate(c, columns): c = c.copy(); c[:-3].reshape(288, 3)[columns] = 0; return c",
         r"not \(288, 3\)",
+    ),
+    (
+        "04",
+        "ablate-check",
+        "solved = ablate\nablate = lambda c, columns: solved(c, slice(32, None))",
+        "columns is not used",
     ),
     ("04", "expected-best-check", "expected_best = lambda returns, size, rng: returns.max()", "the largest of all"),
     (
@@ -355,6 +393,18 @@ def test_a_typical_wrong_answer_earns_the_message_that_names_it(moments, number,
     exec(answer, names)
     with pytest.raises(AssertionError, match=message):
         exec(source, names)
+
+
+def test_cells_that_read_what_comes_along_find_it(moments):
+    reading = [
+        (name[:2], cell["source"])
+        for name in NAMES
+        for cell in read_cells(SOURCES[name])
+        if "PRETRAINED /" in cell["source"]
+    ]
+    assert reading
+    for number, source in reading:
+        exec(source, dict(moments[number, "the end"][0]))
 
 
 def test_every_check_meets_two_wrong_answers():
