@@ -1,4 +1,4 @@
-"""stad_lab: how a car teaches itself to drive inside its own model of the world.
+"""stad_lab: how a car learns a model of its world, drives with it, and dreams in it.
 
 An independent, teachable replication of STAD (Kotyan, Vargas, Venkanna, 2019): World Models on CarRacing, with
 difference images in the auto encoder. Start with the notebooks; `python -m stad_lab --help` is the command line.

@@ -37,7 +37,7 @@ from stad_lab.verify import verify
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line with its help."""
     parser = argparse.ArgumentParser(
-        prog="python -m stad_lab", description="Teach a car to drive inside its own model of the world (STAD)."
+        prog="python -m stad_lab", description="Teach a car to drive with a model of its world (STAD)."
     )
     commands = parser.add_subparsers(dest="command", required=True)
 

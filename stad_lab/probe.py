@@ -3,8 +3,8 @@
 The paper claims that difference images give a better representation of the vehicle's motion, and measures none. A probe
 does: it is a linear model (ridge regression) from z, or from z and M's memory h, to one number that the simulator
 knows. Its R2 on drives that it was not fitted on says what share of that number's variance the latent tells: 1 is all
-of it, 0 is no better than the average, and less than 0 is worse. C is linear too, so what a probe cannot read, C cannot
-use.
+of it, 0 is no better than the average, and less than 0 is worse. C is linear too, before its tanh, so a probe is a fair
+measure of what C can use directly, on drives like these.
 """
 
 import numpy as np
