@@ -268,18 +268,20 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
     With them go the records of the first round and of the world, if the row has its own. Seeds that are made elsewhere,
-    in a folder without seed 0, have V and M from another training by the same settings: the records of that one go to
-    `first_of_seed1` and `world_of_seed1`, by the first of these seeds.
+    in a folder without seed 0, may have V and M from another training by the same settings: the records of that one go
+    to `first_of_seed1` and `world_of_seed1`, by the first of these seeds.
     """
-    kept = []
+    before, kept = sorted((target / name).glob("seed*")), []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:
         source = Path(folder) / name / f"seed{seed}"
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
+    with_seed_0 = bool(kept) and kept[0].name == "seed0"
+    known = worlds(kept) <= worlds([path for path in before if path not in kept])
     for part in ("first", "world"):
-        if kept and (Path(folder) / name / part).exists():
-            own = part if kept[0].name == "seed0" else f"{part}_of_{kept[0].name}"
+        if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
+            own = part if with_seed_0 else f"{part}_of_{kept[0].name}"
             copy_records(Path(folder) / name / part, target / name / own)
     return kept
 
@@ -355,8 +357,9 @@ def summarise(folders: list[Path]) -> dict:
 
     Returns:
         "mean", "standard_deviation" (over all episodes), "interval" (95%, of the mean, over seeds and tracks), "seeds"
-        (the mean of each), "above_900" (share of episodes), "top_90" (mean of each seed's best 90 episodes), and the
-        budget of one seed: "agents", "episodes", "frames" (means over the seeds), with all that was driven before it.
+        (the mean of each), "worlds" (how many trainings of V and M are behind them), "above_900" (share of episodes),
+        "top_90" (mean of each seed's best 90 episodes), and the budget of one seed: "agents", "episodes", "frames"
+        (means over the seeds), with all that was driven before it.
     """
     returns = official_returns(folders)
     budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
@@ -364,9 +367,16 @@ def summarise(folders: list[Path]) -> dict:
         **summarise_episodes(returns.ravel()),
         "interval": bootstrap(returns),
         "seeds": returns.mean(axis=1).tolist(),
+        "worlds": len(worlds(folders)),
         "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
         **{unit: float(np.mean([spent[unit] for spent in budgets])) for unit in ("agents", "episodes", "frames")},
     }
+
+
+def worlds(folders: list[Path]) -> set[tuple[str, str]]:
+    """The identities of the V's and M's that the searches in some folders had; none of a driver of FLOORS."""
+    logs = [load_json(folder / LOG) for folder in folders if (folder / LOG).exists()]
+    return {(log["autoencoder"], log["mdn_rnn"]) for log in logs}
 
 
 def official_returns(folders: list[Path]) -> np.ndarray:

@@ -85,7 +85,7 @@ def test_the_readme_s_rows_are_the_replication_s():
         low, high = found["interval"]
         counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}", f"{found['frames'] / 1e6:.2f} M"]
         scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
-        assert cells(f"`{name}`") == [seeds, *scores, *counts]
+        assert cells(f"`{name}`") == [seeds, f"{found['worlds']}", *scores, *counts]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

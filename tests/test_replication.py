@@ -174,12 +174,16 @@ def test_a_seed_that_was_made_elsewhere_joins_the_row_and_its_world_that_of_seed
     folder, summaries = table
     for place, other in (("here", "seed1"), ("elsewhere", "seed0")):
         shutil.copytree(folder / "two", tmp_path / place / "two", ignore=shutil.ignore_patterns(other, "rollouts"))
-    trained = {"variant": "of another training"}
-    save_json(tmp_path / "elsewhere" / "two" / "world" / "record.json", trained)
     kept = tmp_path / "kept"
     for place, seed in (("here", "seed0"), ("elsewhere", "seed1")):
         assert [path.name for path in keep("two", tmp_path / place, kept)] == [seed]
-    assert summarise(kept_rows(kept)["two"]) == summaries["two"]
+    assert summarise(kept_rows(kept)["two"]) == summaries["two"] and summaries["two"]["worlds"] == 1
+    assert sorted(path.name for path in (kept / "two").iterdir()) == ["first", "seed0", "seed1", "world"]
+    trained, log = {"variant": "of another training"}, tmp_path / "elsewhere" / "two" / "seed1" / "evolution.json"
+    save_json(tmp_path / "elsewhere" / "two" / "world" / "record.json", trained)
+    save_json(log, load_json(log) | {"autoencoder": "of another training"})
+    keep("two", tmp_path / "elsewhere", kept)
+    assert summarise(kept_rows(kept)["two"])["worlds"] == 2
     assert load_json(kept / "two" / "world" / "record.json") == load_json(folder / "two" / "world" / "record.json")
     assert load_json(kept / "two" / "world_of_seed1" / "record.json")["variant"] == trained["variant"]
     first = [kept / "two" / place / "evolution.json" for place in ("first", "first_of_seed1")]
@@ -327,7 +331,8 @@ def test_every_row_that_we_report_holds_its_protocol():
         for folder in folders:
             told, record = load_json(folder / "evaluation.json"), load_json(folder / "record.json")
             assert [episode["track"] for episode in told["episodes"]] == list(range(100))
-            assert record["made_with"]["uncommitted_changes"] is False
+            starts = [record["made_with"], *record.get("continued_with", [])]
+            assert not any(start["uncommitted_changes"] for start in starts)
             if name in ROWS:
                 row = ROWS[name].settings_of(int(folder.name.removeprefix("seed")))
                 assert record["settings"] == row.as_dict() and told["renderer"] == "official"
