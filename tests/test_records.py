@@ -114,6 +114,8 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert returns["two_rounds_frame"].min() > 800
     for name in ("two_rounds_frame", "finished_frame", "finished_input_output"):
         assert returns[name].mean(axis=1).min() > 906
+    medians = {variant: np.median(returns[f"two_rounds_{variant}"]) for variant in VARIANTS}
+    assert max(medians, key=medians.get) == "output" and np.ptp(list(medians.values())) < 5
     for name in ("paper_frame", "paper_input"):  # validation flatters by about a hundred points
         best = load_json(rows[name][0] / LOG)["best"]["validation"]
         assert 90 < best - returns[name][0].mean() < 110
