@@ -115,8 +115,8 @@ def build_parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--json",
         type=Path,
-        help="where to write the result; default evaluation-VARIANT.json in the run, or here, and with -fast or"
-        " -from-TRACK in its name what is not the official evaluation",
+        help="where to write the result; default evaluation-VARIANT.json in the run, or here; -fast, -from-TRACK"
+        " or -N-tracks is added to the name if it is not the official evaluation",
     )
 
     command = commands.add_parser(
@@ -241,7 +241,8 @@ def main(arguments: list[str] | None = None) -> int:
                 if not finish(options.variant, settings, earlier, options.out, executor):
                     print(f"the finish is there in {options.out}: nothing to do")
         elif options.command == "evaluate":
-            other = "-fast" * options.fast + f"-from-{options.first_track}" * (options.first_track > 0)
+            other = "-fast" * options.fast + f"-from-{options.first_track}" * (options.first_track != 0)
+            other += f"-{options.episodes}-tracks" * (options.episodes != 100)
             file = options.json or (options.path or Path()) / f"evaluation-{options.variant}{other}.json"
             chosen = (options.variant, options.path, options.episodes, options.first_track, options.fast)
             load_agent(*chosen[:2])

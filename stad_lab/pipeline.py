@@ -11,7 +11,7 @@ The folder of a run::
     start.safetensors             only in a second round or a finish: the earlier run's C, for the V and M here
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
                                   stage, and the most memory that a process has held by its end (in MB, for each start);
-                                  the time that a killed or failed start took is missing
+                                  of a start that was killed, its time and that it was are missing
 """
 
 import importlib.metadata
@@ -34,7 +34,7 @@ from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory, worker_processes
 from stad_lab.rollouts import COLLECT_FIELDS, collect_rollouts
 from stad_lab.search_space import COMPONENTS, START, find_components
-from stad_lab.second_round import carry_over, collect_again, order_of_episodes
+from stad_lab.second_round import carry_over, check_earlier_v, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import training_device
 
@@ -70,7 +70,7 @@ def train(
 
     Raises:
         ValueError: an unknown variant or stage, a folder with a run of another variant or other settings, or with a
-            file that is damaged or belongs to another run.
+            file that is damaged or belongs to another run, or an earlier run whose V has seen the bar otherwise.
         OSError: another process works in the folder, or a file cannot be read or written.
         TaskError, FloatingPointError: as raised by the stages.
     """
@@ -82,6 +82,8 @@ def train(
             f"agent_episodes={settings.agent_episodes} and earlier={earlier}: a second round needs both, the number of"
             " episodes and the folder of the run whose agent drives them; a first round has neither"
         )
+    if earlier is not None:
+        check_earlier_v(variant, settings, Path(earlier))
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
     stages = {

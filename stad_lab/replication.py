@@ -268,8 +268,8 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
     With them go the records of the first round and of the world, if the row has its own. Seeds that are made elsewhere,
-    in a folder without seed 0, may have V and M from another training by the same settings: the records of that one go
-    to `first_of_seed1` and `world_of_seed1`, by the first of these seeds.
+    in a folder without seed 0, may have V and M from another training by the same settings. If so, the records of that
+    one go to `first_of_seed1` and `world_of_seed1`, by the first of these seeds; if not, they are there already.
     """
     before, kept = sorted((target / name).glob("seed*")), []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:

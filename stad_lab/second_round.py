@@ -44,12 +44,11 @@ def collect_again(
         False if everything was there already, True if something was collected.
 
     Raises:
-        ValueError: the folder holds other rollouts, or the first run is damaged or has another `crop_bar`.
+        ValueError: the folder holds other rollouts, or the first run is damaged.
         FileNotFoundError: the first run has no agent.
         OSError, TaskError: as `collect_rollouts`.
     """
     parameters, _ = load_controller(earlier / CONTROLLER, variant)
-    check_crop(settings, earlier, read_world_model(earlier, variant))
     made_with = {field: getattr(settings, field) for field in (*COLLECT_FIELDS, *AGENT_FIELDS)}
     made_with |= {"variant": variant, "controller_sha256": checksum((earlier / CONTROLLER).read_bytes())}
     numbers = order_of_episodes(settings)
@@ -60,12 +59,13 @@ def collect_again(
         return collect(folder, made_with, drive_either, tasks, longest, executor)
 
 
-def check_crop(settings: Settings, earlier: Path, world_model: WorldModel) -> None:
+def check_earlier_v(variant: str, settings: Settings, earlier: Path) -> None:
     """Raise ValueError unless the earlier V saw the indicator bar as the new one will: the frames are one dataset."""
-    if world_model.crop_bar != settings.crop_bar:
+    seen = read_world_model(earlier, variant).crop_bar
+    if seen != settings.crop_bar:
         raise ValueError(
-            f"crop_bar={settings.crop_bar}, but the run in {earlier} has {world_model.crop_bar}: leave it so in a"
-            " second round, or train a first round anew"
+            f"crop_bar={settings.crop_bar}, but the run in {earlier} has crop_bar={seen}: set that in the second round,"
+            " too, or train a first round anew"
         )
 
 
@@ -131,7 +131,6 @@ def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder:
         load_start(path, new)
         return False
     rollouts, old = Rollouts(rollouts_folder), read_world_model(earlier, variant)
-    check_crop(settings, earlier, old)
     parameters, _ = load_controller(earlier / CONTROLLER, variant)
     wanted, seen = [], []
     for block, number in enumerate(order_of_episodes(settings)):

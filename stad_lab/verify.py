@@ -65,7 +65,9 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         "evaluations": lambda: verify_evaluations(folder),
         "drives": lambda: drive_again(folder, variant, settings, executor),
     }
-    return {name: outcome(check, other_machine(record["made_with"])) for name, check in checks.items()}
+    starts = [record["made_with"], *record.get("continued_with", [])]
+    excuse = "; ".join(filter(None, map(other_machine, starts)))
+    return {name: outcome(check, excuse) for name, check in checks.items()}
 
 
 class NotRepeated(ValueError):
@@ -160,11 +162,12 @@ def verify_evaluations(folder: Path) -> str:
 
 
 def drive_again(folder: Path, variant: str, settings: Settings, executor: Executor | None) -> str:
-    """Drive recorded episodes again: those of an evaluation, or else of the last look at the validation tracks."""
+    """Drive recorded episodes again: of an official evaluation, or of another, or of the last look at validation."""
     if not (folder / CONTROLLER).exists():
         return f"none: {NOT_HERE}"
     parameters, facts = load_controller(folder / CONTROLLER, variant)
     evaluations = [load_json(file) for file in sorted(folder.glob("evaluation*.json"))]
+    evaluations.sort(key=lambda evaluation: evaluation["renderer"] != "official")
     with worker_processes(settings.processes, executor) as executor:
         if evaluations:
             episodes, fast = evaluations[0]["episodes"], evaluations[0]["renderer"] == "fast"

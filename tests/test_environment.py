@@ -105,7 +105,8 @@ def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):
     cut.parent.mkdir(parents=True)
     cut.write_bytes(b"version https://git-lfs.github.com/spec/v1")
     monkeypatch.setattr(environment, "__file__", str(tmp_path / "environment.py"))
-    assert next(environment.check_weights()).state == "red"
+    line = next(environment.check_weights())
+    assert line.state == "red" and "mdn_rnn" in line.found
 
 
 def test_an_unknown_preset_is_red_and_names_the_presets(monkeypatch):

@@ -58,7 +58,7 @@ def test_an_evaluation_goes_to_the_screen_and_to_a_file_that_is_not_the_official
     arguments = ["evaluate", "--variant", "input_output", "--path", run, "--fast", "--episodes", 2]
     process = command_line(*arguments, "--first-track", 10, "--processes", 1)
     assert process.returncode == 0, process.stderr
-    file = run / "evaluation-input_output-fast-from-10.json"
+    file = run / "evaluation-input_output-fast-from-10-2-tracks.json"
     result = load_json(file)
     assert result | {"seconds": 0} == fast | {"seconds": 0}  # one process or two: the same numbers
     assert result["seconds"] > 0

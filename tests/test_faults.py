@@ -464,7 +464,7 @@ def test_verify_finds_a_return_that_no_drive_gives(quick_run, tmp_path, in_this_
     assert main(["verify", str(folder)]) == 1
     assert re.search(r"drives +FAILED: the record says \[.*\], now it was \[", capsys.readouterr().out)
     record = load_json(folder / "record.json")
-    record["made_with"]["processor"] = "a processor with other last bits"
+    record["continued_with"] = [record["made_with"] | {"processor": "a processor with other last bits"}]
     save_json(folder / "record.json", record)
     drives = verify(folder, in_this_process)["drives"]
     assert re.match(r"differs: .*; but processor is '.*' and was 'a processor with", drives)

@@ -63,15 +63,11 @@ def test_a_second_round_asks_for_the_room_that_its_two_kinds_of_episodes_may_tak
     assert asked == pytest.approx(frames * (64 * 64 * 3 + 12) / 1e9, rel=1e-3)
 
 
-def test_a_second_round_that_would_see_the_bar_otherwise_is_refused_before_any_work(second, quick_run, tmp_path):
+def test_a_second_round_that_would_see_the_bar_otherwise_is_refused_before_any_work(quick_run, tmp_path):
     other = dataclasses.replace(SETTINGS, crop_bar=not SETTINGS.crop_bar)
-    with pytest.raises(ValueError, match=f"crop_bar={other.crop_bar}, but the run in .* has {SETTINGS.crop_bar}"):
-        collect_again(VARIANT, other, quick_run, tmp_path / "rollouts")
-    assert not (tmp_path / "rollouts").exists()
-    folder = shutil.copytree(second, tmp_path / "run")
-    (folder / "start.safetensors").unlink()
-    with pytest.raises(ValueError, match="crop_bar"):
-        carry_over(VARIANT, other, quick_run, folder / "rollouts", folder)
+    with pytest.raises(ValueError, match=f"crop_bar={other.crop_bar}, but the run in .*={SETTINGS.crop_bar}: set that"):
+        train(VARIANT, other, tmp_path / "run", earlier=quick_run)
+    assert not (tmp_path / "run").exists()
 
 
 def test_an_unsteady_hand_differs_between_episodes_and_m_remembers_what_was_done(agent, quick_run):
