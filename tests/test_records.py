@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stad_lab import make_env
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.checkpoints import load_json
@@ -17,6 +18,7 @@ from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
 README = (Path(__file__).parent.parent / "README.md").read_text()
+STAGES = ("two_rounds", "finished")
 CLUSTER = (Path(__file__).parent.parent / "docs" / "cluster.md").read_text()
 
 
@@ -31,6 +33,18 @@ def fast_drives(stage, variant):
 
 def returns_of(evaluation):
     return np.array([episode["return"] for episode in evaluation["episodes"]])
+
+
+def sharpest_bends(tracks):
+    """Places of the ten tracks with the sharpest bends to the right, and of those to the left."""
+    env, bends = make_env(fast=True), []
+    for track in tracks:
+        env.reset(seed=track)
+        turned = np.unwrap([tile[1] for tile in env.unwrapped.track])
+        turned = turned[20:] - turned[:-20]
+        bends.append((-turned.min(), turned.max()))
+    env.close()
+    return np.argsort(bends, axis=0)[-10:].T
 
 
 def cells(label, page=README):
@@ -119,7 +133,13 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     for name in ("paper_frame", "paper_input"):  # validation flatters by about a hundred points
         best = load_json(rows[name][0] / LOG)["best"]["validation"]
         assert 90 < best - returns[name][0].mean() < 110
-    stages = itertools.product(("two_rounds", "finished"), VARIANTS)
+    fresh = [returns_of(read(f"fast/{stage}/{v}_100.json")) < 800 for v in VARIANTS for stage in STAGES]
+    right, left = sharpest_bends(range(100, 200))
+    failed = np.array(fresh).sum(axis=0)
+    assert 0.4 < failed[right].sum() / failed.sum() < 0.6 and not np.array(fresh)[:2, right].any()  # first is `frame`
+    assert (failed[right].sum() - failed[25], failed.sum() - failed[25]) == (6, 18)
+    assert len(both := set(right) & set(left)) == 4 and failed[left].sum() == failed[list(both)].sum() + 1
+    stages = itertools.product(STAGES, VARIANTS)
     fast = {pair: np.concatenate([returns_of(found) for found in fast_drives(*pair)]) for pair in stages}
     assert 0 < fast["two_rounds", "output"].mean() - fast["two_rounds", "frame"].mean() < 1
     assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
