@@ -22,7 +22,7 @@ if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports t
 from stad_lab.agent import load_agent, run_folder
 from stad_lab.autoencoder import VARIANTS, check_variant
 from stad_lab.benchmark import PARTS, benchmark
-from stad_lab.checkpoints import check_writable, load_json, save_json, write_bytes
+from stad_lab.checkpoints import check_writable, save_json, write_bytes
 from stad_lab.evaluation import describe, evaluate
 from stad_lab.finish import FINISH, OPEN, finish, finish_settings
 from stad_lab.parallel import TaskError
@@ -266,9 +266,7 @@ def main(arguments: list[str] | None = None) -> int:
             settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
             file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)
             check_writable(file)
-            for part in parts:  # each is kept as soon as it is measured
-                found = study(settings, rollouts, options.out, [part])
-                save_json(file, (load_json(file) if file.exists() else {}) | found)
+            study(settings, rollouts, options.out, parts)
             print(f"every measurement: {file}")
         elif options.command == "benchmark":
             check_writable(options.json)

@@ -162,10 +162,15 @@ def open_record(
     check_same_run(
         path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
     )
-    made, starts = provenance(command), [record["made_with"], *record.get("continued_with", [])]
-    if made != starts[-1]:
-        record["continued_with"] = [*starts[1:], made]
+    made = provenance(command)
+    if made != starts(record)[-1]:
+        record["continued_with"] = [*starts(record)[1:], made]
     return record | {"settings": settings.as_dict()}
+
+
+def starts(record: dict) -> list[dict]:
+    """What a run was made with, and all that it was continued with, the last start at the end."""
+    return [record["made_with"], *record.get("continued_with", [])]
 
 
 def command_of(variant: str, settings: Settings) -> str:

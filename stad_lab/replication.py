@@ -271,14 +271,14 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     in a folder without seed 0, may have V and M from another training by the same settings. If so, the records of that
     one go to `first_of_seed1` and `world_of_seed1`, by the first of these seeds; if not, they are there already.
     """
-    before, kept = sorted((target / name).glob("seed*")), []
+    kept = []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:
         source = Path(folder) / name / f"seed{seed}"
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
     with_seed_0 = bool(kept) and kept[0].name == "seed0"
-    known = worlds(kept) <= worlds([path for path in before if path not in kept])
+    known = worlds(kept) <= worlds([path for path in (target / name).glob("seed*") if path not in kept])
     for part in ("first", "world"):
         if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
             own = part if with_seed_0 else f"{part}_of_{kept[0].name}"

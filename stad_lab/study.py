@@ -20,6 +20,7 @@ from tqdm.auto import tqdm
 
 from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, check_facts, kl_divergence, load_autoencoder
+from stad_lab.checkpoints import load_json, save_json
 from stad_lab.drives import (
     MOTION,
     Drive,
@@ -73,7 +74,7 @@ def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str
     Args:
         settings: of the rollouts, and of what is trained here; `laptop` is what the shipped V and M were made with.
         rollouts_folder: collected if they are not there.
-        work: folder for what is trained.
+        work: folder for what is trained, and for `study.json`, to which each part is added as soon as it is measured.
         parts: some of PARTS.
 
     Returns:
@@ -82,11 +83,12 @@ def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str
     check_parts(parts)
     collect_rollouts(settings, rollouts_folder)
     drives = random_drives(max(12, settings.episodes // 5), settings.processes)
-    result = {}
+    file, result = Path(work) / "study.json", {}
     for name in parts:
         found = PARTS[name](settings, Path(rollouts_folder), Path(work), drives)
         made_with = provenance(f"python -m stad_lab study --settings {settings.name} --part {name} --out ...")
         result[name] = {**found, "drives": len(drives), "settings": settings.as_dict(), "made_with": made_with}
+        save_json(file, (load_json(file) if file.exists() else {}) | result)
     return result
 
 

@@ -26,7 +26,7 @@ from stad_lab.evolution import (
 )
 from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.parallel import run_tasks, worker_processes
-from stad_lab.pipeline import EARLIER, MACHINE, PACKAGES, provenance
+from stad_lab.pipeline import EARLIER, MACHINE, PACKAGES, provenance, starts
 from stad_lab.rollouts import Rollouts
 from stad_lab.search_space import search_space
 from stad_lab.settings import Settings
@@ -65,8 +65,7 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         "evaluations": lambda: verify_evaluations(folder),
         "drives": lambda: drive_again(folder, variant, settings, executor),
     }
-    starts = [record["made_with"], *record.get("continued_with", [])]
-    excuse = "; ".join(filter(None, map(other_machine, starts)))
+    excuse = "; ".join(filter(None, map(other_machine, starts(record))))
     return {name: outcome(check, excuse) for name, check in checks.items()}
 
 

@@ -400,7 +400,7 @@ def test_cells_that_read_what_comes_along_find_it(moments):
         (name[:2], cell["source"])
         for name in NAMES
         for cell in read_cells(SOURCES[name])
-        if "PRETRAINED /" in cell["source"]
+        if "evaluation.json" in cell["source"]
     ]
     assert reading
     for number, source in reading:

@@ -12,7 +12,7 @@ from stad_lab.__main__ import main
 from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import LOG, fitness_curves
-from stad_lab.pipeline import total_budget
+from stad_lab.pipeline import starts, total_budget
 from stad_lab.plots import plot_curves, plot_episodes, plot_intervals, plot_returns, plot_seeds, plot_stacks
 from stad_lab.replication import (
     FLOORS,
@@ -331,8 +331,7 @@ def test_every_row_that_we_report_holds_its_protocol():
         for folder in folders:
             told, record = load_json(folder / "evaluation.json"), load_json(folder / "record.json")
             assert [episode["track"] for episode in told["episodes"]] == list(range(100))
-            starts = [record["made_with"], *record.get("continued_with", [])]
-            assert not any(start["uncommitted_changes"] for start in starts)
+            assert not any(start["uncommitted_changes"] for start in starts(record))
             if name in ROWS:
                 row = ROWS[name].settings_of(int(folder.name.removeprefix("seed")))
                 assert record["settings"] == row.as_dict() and told["renderer"] == "official"
