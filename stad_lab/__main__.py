@@ -280,6 +280,8 @@ def main(arguments: list[str] | None = None) -> int:
             agent = load_agent(options.variant, options.path)
             shown = (agent, options.track, options.first, options.frames)
             kind = options.out.suffix.lstrip(".").lower()
+            if not options.viewer and kind != "gif":
+                raise ValueError(f"--out {options.out}: expected a file that ends in .gif (or, with --viewer, .webp)")
             check_writable(options.out)
             write_bytes(options.out, film_viewer(*shown, kind=kind) if options.viewer else film_agent(*shown))
             print(f"filmed to {options.out}")

@@ -79,8 +79,20 @@ class Agent:
         self.latents, self.hidden = latents.numpy(), self.state[0][0].numpy()
         parameters = self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
         actions = control(parameters, np.concatenate([self.latents, self.hidden], axis=1))
-        _, self.state = self.mdn_rnn.remember(latents[:, None], torch.from_numpy(actions)[:, None], self.state)
+        self.take_in(actions, self.state)
         return actions
+
+    @torch.inference_mode()
+    def take_in(self, actions: np.ndarray, before: tuple[torch.Tensor, torch.Tensor] | None) -> None:
+        """Let M remember the last z with these actions, float32 (cars, 3).
+
+        `act` does it with its own. Whoever drives otherwise calls it again, with what was done in truth.
+
+        Args:
+            before: `state` as it was before that `act`.
+        """
+        seen, done = torch.from_numpy(self.latents)[:, None], torch.from_numpy(actions)[:, None]
+        _, self.state = self.mdn_rnn.remember(seen, done, before)
 
     def keep(self, cars: np.ndarray) -> None:
         """Go on with some of the cars only, until the next reset: `cars` are their indices among the present ones."""
@@ -165,7 +177,16 @@ def read_world_model(folder: Path, variant: str) -> WorldModel:
     return WorldModel(autoencoder, mdn_rnn, v_facts["stride"], v_facts["crop_bar"], identities)
 
 
-load_world_model = functools.lru_cache(maxsize=2)(read_world_model)  # so that a worker process reads them once
+def load_world_model(folder: Path, variant: str) -> WorldModel:
+    """As `read_world_model`, but kept for as long as the files are the same, so that workers read them once."""
+    files = [folder / name for name in ("autoencoder.safetensors", "mdn_rnn.safetensors")]
+    return read_once(folder, variant, tuple(file.stat().st_mtime_ns if file.exists() else 0 for file in files))
+
+
+@functools.lru_cache(maxsize=2)
+def read_once(folder: Path, variant: str, changed: tuple[int, int]) -> WorldModel:
+    """`read_world_model`, once for all calls with the same times at which the two files `changed`."""
+    return read_world_model(folder, variant)
 
 
 def run_folder(variant: str, path: str | Path | None = None) -> Path:

@@ -39,8 +39,11 @@ def check(
 
 
 def to_numpy(value: object) -> np.ndarray:
-    """A number, list, array or tensor as an array; a tensor's gradient is left behind."""
-    return value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+    """A number, list, array or tensor as an array; a tensor's gradient is left behind. AssertionError if ragged."""
+    try:
+        return value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+    except ValueError as error:
+        raise AssertionError(f"this is no array, since its parts are not all as long ({error})") from error
 
 
 def agree(found: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
@@ -57,9 +60,14 @@ def describe_difference(found: np.ndarray, expected: np.ndarray) -> str:
         return f"found dtype {found.dtype}, expected numbers"
     if found.shape != expected.shape:
         return f"found shape {found.shape}, expected {expected.shape}"
-    if not np.isfinite(found).all() and np.isfinite(expected).all():
-        return f"found {np.sum(~np.isfinite(found))} numbers that are not finite (NaN or infinite), expected none"
-    error = np.abs(found.astype(float) - expected.astype(float))
-    place = tuple(int(i) for i in np.unravel_index(np.nanargmax(error), error.shape))
+    strange, wanted = ~np.isfinite(found), ~np.isfinite(expected)
+    if not np.array_equal(strange, wanted):
+        elsewhere = ", elsewhere" if strange.sum() == wanted.sum() else ""
+        return (
+            f"found {strange.sum()} numbers that are not finite (NaN or infinite), expected {wanted.sum() or 'none'}"
+            f"{elsewhere}"
+        )
+    error = np.where(wanted, 0, np.abs(found.astype(float) - expected.astype(float)))
+    place = tuple(int(i) for i in np.unravel_index(np.argmax(error), error.shape))
     where = f" at index {place}" if place else ""
     return f"found {found[place]:.6g}{where}, expected {expected[place]:.6g}"

@@ -28,9 +28,11 @@ class ClusterExecutor(ClientExecutor):
         """
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sending large graph")  # once for each run, not for each task
-            stand_in = self._client.submit(itself, value, pure=False)
-        for fetched in [self._client.submit(fetch, stand_in, workers=[w], pure=False) for w in self._client.nthreads()]:
-            fetched.result()
+            stand_in, fetched = self._client.submit(itself, value, pure=False), []
+        for worker in self._client.nthreads():  # another one may do it if that one is lost before it could
+            fetched.append(self._client.submit(fetch, stand_in, workers=[worker], allow_other_workers=True, pure=False))
+        for future in fetched:
+            future.result()
         return stand_in
 
 
@@ -53,7 +55,8 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
 
     Raises:
         OSError: no scheduler answers, or it has no worker.
-        ValueError: a worker has other versions than this process, and so would drive otherwise.
+        ValueError: a worker that is there by now lacks a package, or has another version than this process, and so
+            would drive otherwise.
     """
     try:
         client = Client(address, timeout=patience, set_as_default=False)
@@ -70,7 +73,12 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
                 f"the scheduler at {address} has no worker after {patience:.0f} seconds: start one with"
                 f" `dask worker {address} --nthreads 1`"
             ) from error
-        check_versions(client.run(versions))
+        try:
+            check_versions(client.run(versions))
+        except ImportError as error:  # there, since all of it is here
+            raise ValueError(
+                f"a worker of {address} lacks a package ({error}): install the same environment.txt on all machines"
+            ) from error
         yield ClusterExecutor(client, pure=False)
 
 

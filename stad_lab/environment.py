@@ -19,6 +19,7 @@ from pathlib import Path
 GREEN, AMBER, RED = "green", "amber", "red"
 COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
+LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = (
     *("numpy", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma", "sklearn", "safetensors", "matplotlib"),
     *("PIL", "ipywidgets"),
@@ -222,9 +223,11 @@ def check_memory() -> Iterator[Line]:
     import psutil
 
     free = psutil.virtual_memory().available
-    limit, used = (Path("/sys/fs/cgroup", name) for name in ("memory.max", "memory.current"))
+    limit, used, statistics = (LIMITS / f"memory.{name}" for name in ("max", "current", "stat"))
     if limit.exists() and limit.read_text().strip().isdigit():
-        free = min(free, int(limit.read_text()) - int(used.read_text()))
+        # Pages of files that were read count as used there, though the system gives them back when they are wanted.
+        counts = dict(line.split() for line in statistics.read_text().splitlines()) if statistics.exists() else {}
+        free = min(free, int(limit.read_text()) - int(used.read_text()) + int(counts.get("inactive_file", 0)))
     remedy = "close other programs and shut down notebooks that you no longer use (Kernel > Shut Down All Kernels)"
     yield graded("free memory", free / 1e9, amber=2.0, red=0.7, remedy=remedy)
 

@@ -87,14 +87,18 @@ def report(tracks: list[int], returns: np.ndarray, frames: np.ndarray) -> dict:
 
 def summarise(returns: np.ndarray) -> dict:
     """Mean, standard deviation, 95% interval of the mean (bootstrap over episodes) and share above 900."""
-    rng = np.random.default_rng(0)
-    means = rng.choice(returns, (10_000, len(returns))).mean(axis=1)
     return {
         "mean": float(returns.mean()),
         "standard_deviation": float(returns.std(ddof=1)) if len(returns) > 1 else 0.0,
-        "interval": [float(bound) for bound in np.percentile(means, [2.5, 97.5])],
+        "interval": bootstrap_interval(returns, 10_000),
         "above_900": float((returns > SOLVED).mean()),
     }
+
+
+def bootstrap_interval(values: np.ndarray, resamples: int) -> list[float]:
+    """95% interval of the mean of `values`, float (n,), by bootstrap: [low, high]."""
+    means = np.random.default_rng(0).choice(values, (resamples, len(values))).mean(axis=1)
+    return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
 
 
 def describe(result: dict) -> str:

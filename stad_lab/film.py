@@ -6,7 +6,7 @@ from tqdm.auto import tqdm
 from stad_lab.agent import Agent
 from stad_lab.autoencoder import to_array, to_pictures
 from stad_lab.dream import to_uint8
-from stad_lab.drives import Drive, Inside, look_inside, record_drive
+from stad_lab.drives import FRAMES_A_SECOND, Drive, Inside, look_inside, record_drive
 from stad_lab.frames import earlier_frames
 from stad_lab.plots import check_kind, difference_colors, moving_figure, moving_picture, plot_moment
 
@@ -22,7 +22,7 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
         every: show one frame in so many; the film runs at the real speed, 50 frames a second.
 
     Raises:
-        ValueError: the episode ends before `first`.
+        ValueError: the episode ends before `first`, or a number that is out of range.
     """
     drive = record_longer_drive(agent, track, first, frames)
     film = drive.frames(agent.crop_bar)
@@ -34,7 +34,7 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
         "what changes": difference_colors(to_array(difference)),
         "what V makes of it": to_uint8(agent.autoencoder.reconstruct(frame, difference)[0]),
     }
-    return moving_picture(columns, fps=50 / every)
+    return moving_picture(columns, fps=FRAMES_A_SECOND / every)
 
 
 def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 3, kind: str = "gif") -> bytes:
@@ -44,7 +44,7 @@ def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 
         kind: "gif" or "webp".
 
     Raises:
-        ValueError: the episode ends before `first`, or another kind.
+        ValueError: as `film_agent`, or another kind.
     """
     check_kind(kind)
     drive = record_longer_drive(agent, track, first, frames)
@@ -55,11 +55,14 @@ def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 
 def film_inside(drive: Drive, inside: Inside, first: int = 0, every: int = 3, kind: str = "gif") -> bytes:
     """The rollout viewer as an animation, "gif" or "webp": one moment in `every`, at the real speed."""
     moments = tqdm(range(first, len(drive), every), "film", unit="picture")
-    return moving_figure((plot_moment(drive, inside, moment) for moment in moments), 50 / every, kind)
+    return moving_figure((plot_moment(drive, inside, moment) for moment in moments), FRAMES_A_SECOND / every, kind)
 
 
 def record_longer_drive(agent: Agent, track: int, first: int, frames: int) -> Drive:
     """Record a drive of at most `first + frames` frames. Raises ValueError if it ends before frame `first`."""
+    for name, value, least in (("track", track, 0), ("first", first, 0), ("frames", frames, 1)):
+        if value < least:
+            raise ValueError(f"{name}={value}: expected at least {least}")
     drive = record_drive(agent, track, first + frames)
     if len(drive) <= first:
         raise ValueError(f"first={first}, but on track {track} the episode ends after {len(drive)} frames")

@@ -42,6 +42,8 @@ def finish_settings(earlier: str | Path, **changes) -> Settings:
         ValueError, FileNotFoundError: an unknown field, a value out of range, or no record of a run.
     """
     record = load_json(Path(earlier) / "record.json", EARLIER)
+    if "settings" not in record:
+        raise ValueError(f"{earlier} is of {record['variant']}, which has no C to go on from: {EARLIER}")
     return Settings.from_dict(record["settings"] | FINISH | changes)
 
 

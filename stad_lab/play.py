@@ -48,7 +48,8 @@ class Hand:
 
     Attributes:
         held: which of PEDALS are down.
-        action: the last action, float32 (3,): steering in [-1, 1], gas in [0, 0.7], brake in [0, 0.8].
+        action: the last action, float32 (3,): steering in [-1, 1], gas in [0, 0.7], brake in [0, 0.8]; taken over from
+            an agent, gas and brake may begin with up to 1.
     """
 
     def __init__(self):
@@ -179,7 +180,7 @@ class Session:
         return to_drive(self.rows)
 
     def by_hand(self) -> np.ndarray:
-        """Which frames of the real episode the hand drove: bool (T,)."""
+        """Which frames of the real episode the hand drove: bool (T,). While a seat drives, it grows."""
         return np.array([driver == "hand" for driver in self.drivers], bool)
 
     def dreamt(self) -> Dreamt:
@@ -192,12 +193,10 @@ class Session:
     def _step_real(self) -> None:
         action, motion = self._act(self.proposed), true_motion(self.env)
         if self.driver == "hand":  # M remembered what the agent would have done: tell it what was done
-            done, seen = torch.from_numpy(action), torch.from_numpy(self.agent.latents)
-            with torch.inference_mode():
-                _, self.agent.state = self.agent.mdn_rnn.remember(seen[:, None], done[None, None], self.before)
+            self.agent.take_in(action[None], self.before)
         following, reward, terminated, truncated, _ = self.env.step(action)
+        self.drivers.append(self.driver)  # first: who reads `drive` and then `by_hand` meanwhile has all of the latter
         self.rows.append((self.observation, action, reward, motion))
-        self.drivers.append(self.driver)
         self.observation, self.score = following, self.score + reward
         self.real_ended = terminated or truncated
         self._look()

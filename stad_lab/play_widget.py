@@ -4,6 +4,7 @@ The loop is a thread of the kernel, so that other cells run while the car drives
 *and* when it comes up, as long as the pointer rests on the picture; the frame around the picture shows that it does.
 """
 
+import html
 import threading
 import time
 
@@ -138,7 +139,8 @@ class Seat:
         elif kind == "keydown" and not event.get("repeat") and key == "KeyP":
             self.go.value = not self.go.value
         elif kind == "keydown" and not event.get("repeat") and key == "KeyT":
-            self.driver.value = "agent" if self.session.driver == "hand" else "hand"
+            self._command(self.session.give, "agent" if self.session.driver == "hand" else "hand")
+            self.driver.value = self.session.driver  # the buttons may have been behind: another cell can `give`
 
     def press(self, pedal: str, down: bool) -> None:
         """Hold a pedal, or let it go."""
@@ -209,7 +211,7 @@ def describe(session: Session, pace: float, error: str = "") -> str:
     state = "the episode has ended" if session.ended else f"{pace:.0f} pictures a second" if pace else "paused"
     held = ", ".join(sorted(session.hand.held)) or "none"
     line = f"<b>{who} {where}</b><br>{score}, frame {count}, {state}<br>keys held: {held}"
-    return f'<div style="line-height: 1.4">{line}{f"<br><b>{error}</b>" if error else ""}</div>'
+    return f'<div style="line-height: 1.4">{line}{f"<br><b>{html.escape(error)}</b>" if error else ""}</div>'
 
 
 def named(name: str, control: ipywidgets.Widget) -> ipywidgets.VBox:

@@ -441,6 +441,7 @@ def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figu
         axis.axhline(900, color="grey", lw=0.8, ls=":")
         axis.set_title(f"{name} agent of a generation", fontsize=10)
         axis.set_xlabel("generation")
+    window = min([window, *(curves.shape[2] for curves in runs.values())])
     axes[0, 0].set_ylabel(f"fitness, mean of {window} generations")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
     figure.suptitle(title, fontsize=11)

@@ -86,6 +86,8 @@ def check_rows(features: np.ndarray, targets: np.ndarray, drives: np.ndarray) ->
         )
     if not (np.isfinite(features).all() and np.isfinite(targets).all()):
         raise ValueError("features or targets that are not finite: leave those rows out")
+    if not np.ptp(targets, axis=0).all():
+        raise ValueError("a target has one value throughout: there is nothing that a probe could tell, leave it out")
     count = len(np.unique(drives))
     if count < 10:
         raise ValueError(f"{count} drives: expected at least 10, to fit on some and to measure on the others")

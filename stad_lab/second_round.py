@@ -104,9 +104,7 @@ def drive_noisily(agent: Agent, settings: Settings, index: int) -> tuple[np.ndar
         before, action = agent.state, agent.act(observation)
         noise = 0.9 * noise + unsteadiness * rng.standard_normal(2)
         action[:2] = np.clip(action[:2] + noise, [-1, 0], 1)
-        _, agent.state = agent.mdn_rnn.remember(
-            torch.from_numpy(agent.latents)[:, None], torch.from_numpy(action)[None, None], before
-        )
+        agent.take_in(action[None], before)
         frames.append(to_frame(observation, settings.crop_bar))
         actions.append(action)
         observation, reward, terminated, truncated, _ = env.step(action)

@@ -19,7 +19,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model
-from stad_lab.autoencoder import VARIANTS, AutoEncoder, check_facts, kl_divergence, load_autoencoder
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, kl_divergence, load_autoencoder
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.drives import (
     MOTION,
@@ -30,10 +30,11 @@ from stad_lab.drives import (
     remember_drive,
     road_in_sight,
 )
+from stad_lab.evaluation import bootstrap_interval
 from stad_lab.frames import earlier_frames
 from stad_lab.mdn_rnn import MDNRNN, check_partner, encode_rollouts, fit_mdn_rnn, load_mdn_rnn
 from stad_lab.parallel import worker_processes
-from stad_lab.pipeline import provenance, train
+from stad_lab.pipeline import open_record, provenance, train
 from stad_lab.probe import probe
 from stad_lab.quality import (
     ACTIVE,
@@ -57,14 +58,16 @@ SHORTER = 0.3  # the V's of the comparisons are trained for this share of the st
 CONTENDERS = {  # lesser M's: what is changed, and whether they see the actions
     "one Gaussian": ({"mixtures": 1}, True),
     "no actions": ({}, False),
-    "no memory": ({"m_sequence": 1, "m_batch": 6400}, True),
+    "no memory": ({"m_sequence": 1}, True),  # on as many frames, each on its own
 }
 DRIVE_FRAMES, AGENT_FRAMES = 150, 360  # of a drive of the random driver, and of the agent
 # Frames of a drive that are not probed: without a difference image, or with the opening zoom, which tells the speed.
 RANDOM_SKIP, AGENT_SKIP = max(STRIDES), 60
+STUDY_COMMAND = "python -m stad_lab study --settings {} --part {} --out ..."
 RECORD = Path(__file__).parent / "records" / "study.json"  # the study that we report
 AWAKE = 30  # frames that M sees before a dream
 HORIZON = [1, 2, 3, 5, 7, 10, 14, 20, 30, 40, 50, 60, 70, 80, 90, 100]  # dreamed steps at which it is judged
+RESAMPLES = 1000  # of the drives, for an interval
 DREAMERS = 60  # drives in which M falls asleep
 
 
@@ -86,7 +89,7 @@ def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str
     file, result = Path(work) / "study.json", {}
     for name in parts:
         found = PARTS[name](settings, Path(rollouts_folder), Path(work), drives)
-        made_with = provenance(f"python -m stad_lab study --settings {settings.name} --part {name} --out ...")
+        made_with = provenance(STUDY_COMMAND.format(settings.name, name))
         result[name] = {**found, "drives": len(drives), "settings": settings.as_dict(), "made_with": made_with}
         save_json(file, (load_json(file) if file.exists() else {}) | result)
     return result
@@ -266,17 +269,11 @@ def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
     return {
         name: {
             "nats": float(found.mean()),
-            "interval": bootstrap_interval(found),
-            "more_than_M": bootstrap_interval(found - means["M"]),
+            "interval": bootstrap_interval(found, RESAMPLES),
+            "more_than_M": bootstrap_interval(found - means["M"], RESAMPLES),
         }
         for name, found in means.items()
     }
-
-
-def bootstrap_interval(values: np.ndarray) -> list[float]:
-    """95% interval of the mean of `values` (drives,)."""
-    again = np.random.default_rng(0).choice(values, (1000, len(values))).mean(axis=1)
-    return [float(bound) for bound in np.percentile(again, [2.5, 97.5])]
 
 
 def simple_forecasts(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
@@ -299,6 +296,8 @@ def lesser_forecasts(
     for name, (changes, sees_actions) in CONTENDERS.items():
         path = work / name.replace(" ", "_") / "mdn_rnn.safetensors"
         lesser = dataclasses.replace(settings, **changes)
+        lesser = dataclasses.replace(lesser, m_batch=settings.m_batch * settings.m_sequence // lesser.m_sequence)
+        open_record(path.parent, "input", lesser, STUDY_COMMAND.format(settings.name, "mdn_rnn"))
         if not path.exists():
             encoded = encoded or encode_rollouts(world_model.autoencoder, rollouts, settings.stride)
             torch.manual_seed(settings.seed)
@@ -306,7 +305,6 @@ def lesser_forecasts(
             shown = [action * sees_actions for action in rollouts.actions]
             fit_mdn_rnn(path, mdn_rnn, "input", identity, encoded, shown, rollouts, lesser)
         mdn_rnn, facts = load_mdn_rnn(path, "input")
-        check_facts(path, facts, lesser)
         check_partner(path, facts, autoencoder=identity)
         if lesser.m_sequence > 1:
             result[name] = mixture_nll(forecast(mdn_rnn, z, actions * sees_actions), z)

@@ -134,9 +134,10 @@ def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
     """
     names = ["frame", "difference image"][: 1 + autoencoder.redraws_difference]
     pictures = [ipywidgets.HTML() for _ in names]
+    reach = max(4, int(np.ceil(np.abs(z).max())))  # of a normal latent hardly any is beyond 4
     sliders = [
         ipywidgets.FloatSlider(
-            round(float(value), 2), min=-4, max=4, step=0.05, description=f"z[{number}]", readout_format=".1f"
+            round(float(value), 2), min=-reach, max=reach, step=0.05, description=f"z[{number}]", readout_format=".1f"
         )
         for number, value in enumerate(z)
     ]

@@ -47,7 +47,7 @@ def guard(event, arguments):
         forbid(f"{event} {arguments}")
     if event == "open" and isinstance(arguments[0], str) and arguments[2] is not None:
         where = os.path.abspath(arguments[0])
-        writes, allowed = arguments[2] & (os.O_WRONLY | os.O_RDWR), os.environ["GUARDED"].split(":")
+        writes, allowed = arguments[2] & (os.O_WRONLY | os.O_RDWR), os.environ["GUARDED"].split(os.pathsep)
         if writes and not where.startswith(tuple(allowed)):
             forbid(f"writing to {where}")
 
@@ -87,7 +87,9 @@ def train_quickly(folder, guard):
     """Train with the quick settings under guard: what came of it, as a dictionary."""
     guard.mkdir()
     (guard / "sitecustomize.py").write_text(GUARD)
-    may_write = f"{folder}:{guard}:/dev/:/proc/"  # PyTorch looks for a place for temporary files
+    may_write = os.pathsep.join(
+        [str(folder), str(guard), "/dev/", "/proc/"]
+    )  # PyTorch looks for a place for temporary files
     guarded = {"GUARDED": may_write, "TMPDIR": str(guard), "PYTHONPATH": str(guard), "PYTHONDONTWRITEBYTECODE": "1"}
     begin = time.perf_counter()
     process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from stad_lab import Agent, load_agent, make_env
-from stad_lab.agent import drive, load_controller, run_folder, save_controller
+from stad_lab.agent import PRETRAINED, drive, load_controller, load_world_model, run_folder, save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder
 from stad_lab.controller import parameter_count
 from stad_lab.mdn_rnn import MDNRNN
@@ -81,6 +81,14 @@ def test_keep_goes_on_with_some_of_the_cars(cars, observations):
         expected = before.act_batch([observations[start + t] for start in starts])
         kept = agent.act_batch([observations[start + t] for start in (0, 40)])
         assert np.allclose(kept, expected[[0, 2]], atol=1e-5)
+
+
+def test_a_folder_that_is_made_again_is_read_again(tmp_path):
+    run = tmp_path / "run"
+    for shipped, cropped in (("input", True), ("second_round/input", False)):
+        shutil.copytree(PRETRAINED / shipped, run, dirs_exist_ok=True, copy_function=shutil.copy)
+        assert load_world_model(run, "input").crop_bar is cropped
+        assert load_world_model(run, "input") is load_world_model(run, "input")
 
 
 def test_reset_forgets_the_past(observations):

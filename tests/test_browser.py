@@ -229,7 +229,10 @@ def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(r
     tells("The agent drives on track 1")
     page.get_by_role("button", name="the dream").click()
     tells("The agent drives in the dream")
-    sees_another_picture(picture, lambda: page.locator(".noUi-handle").first.press("ArrowRight"))
+    temperature = page.locator(".widget-readout").first
+    before = temperature.inner_text()
+    page.locator(".noUi-handle").first.press("ArrowRight")
+    wait_for(lambda: temperature.inner_text() != before, "another temperature", SLOW)
     picture.hover()
     page.keyboard.press("t")
     tells("You drive in the dream")

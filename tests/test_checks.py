@@ -37,6 +37,25 @@ def test_a_wrong_answer_is_told_what_is_wrong(found, message):
         check("f(x)", found, RIGHT, {"the sign is turned round": -RIGHT, "two NaN": np.full(2, np.nan)})
 
 
+@pytest.mark.parametrize(
+    ("found", "expected", "message"),
+    [
+        ([1.0, 2.0], [1.0, np.nan], "found 0 numbers that are not finite .*expected 1$"),
+        ([np.nan, 2.0], [1.0, np.nan], "found 1 numbers that are not finite .*expected 1, elsewhere"),
+        ([np.inf, np.inf], [np.nan, np.nan], r"found inf at index \(0,\), expected nan"),
+        ([5.0, np.nan], [1.0, np.nan], r"found 5 at index \(0,\), expected 1"),
+    ],
+)
+def test_answers_that_are_not_finite_are_told_what_is_wrong(found, expected, message):
+    with pytest.raises(AssertionError, match=message):
+        check("f(x)", np.array(found), np.array(expected))
+
+
+def test_a_list_of_unequal_parts_is_told_so():
+    with pytest.raises(AssertionError, match="parts are not all as long"):
+        check("f(x)", [[1, 2], [3]], [[1, 2], [3, 4]])
+
+
 def test_right_values_of_another_kind_are_refused():
     with pytest.raises(AssertionError, match="right values, but dtype float64: expected int64"):
         check("f(x)", np.array([1.0, 2.0]), np.array([1, 2]))

@@ -1,5 +1,6 @@
 """Beyond one machine: a real Dask scheduler and four workers, processes of their own with their own addresses."""
 
+import importlib.metadata
 import json
 import os
 import subprocess
@@ -159,6 +160,23 @@ def test_an_address_without_a_scheduler_is_an_error_that_says_how_to_start_one()
         pass
 
 
-def test_a_worker_with_other_versions_is_refused():
+def test_a_cluster_whose_workers_have_other_versions_is_refused(scheduler, monkeypatch):
+    installed = importlib.metadata.version
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.1" if name == "numpy" else installed(name))
+    with pytest.raises(ValueError, match=r"worker tcp://.* has numpy .*, here it is 0\.1"), cluster(scheduler[0]):
+        pass
+
+
+def test_a_worker_that_lacks_a_package_is_refused(scheduler, monkeypatch):
+    monkeypatch.setattr("stad_lab.cluster.versions", lack_a_package)
+    with pytest.raises(ValueError, match=r"a worker of tcp://.* lacks a package \(.*nowhere"), cluster(scheduler[0]):
+        pass
+
+
+def lack_a_package():
+    return {"nowhere": importlib.metadata.version("nowhere")}
+
+
+def test_a_worker_with_other_versions_is_named():
     with pytest.raises(ValueError, match=r"worker tcp://far has torch 1.0, here it is .*install the same"):
         check_versions({"tcp://near": versions(), "tcp://far": versions() | {"torch": "1.0"}})

@@ -319,6 +319,25 @@ def test_a_wrong_number_ends_in_one_clear_line(options, run, capsys):
     assert "expected" in error
 
 
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--track", "-1"], "track=-1: expected at least 0"),
+        (["--first", "-6"], "first=-6: expected at least 0"),
+        (["--frames", "0"], "frames=0: expected at least 1"),
+        (["--out", "drive.webp"], "drive.webp: expected a file that ends in .gif"),
+    ],
+)
+def test_a_film_that_cannot_be_made_is_refused_before_the_drive(
+    options, message, quick_run, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", "drive.gif", *options]
+    assert main([str(argument) for argument in arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
 def test_a_film_of_another_kind_is_refused_before_the_drive(quick_run, tmp_path, capsys):
     arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", tmp_path / "drive.mp4", "--viewer"]
     assert main([str(argument) for argument in arguments]) == 2

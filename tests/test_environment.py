@@ -5,6 +5,7 @@ import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -97,6 +98,16 @@ def test_a_working_folder_that_is_missing_or_read_only_is_red(tmp_path, monkeypa
 def test_little_room_is_amber_and_none_is_red():
     states = [environment.graded("free disk", found, amber=3, red=1, remedy="make room").state for found in (4, 2, 0.5)]
     assert states == ["green", "amber", "red"]
+
+
+def test_in_a_container_files_that_were_read_do_not_count_as_used_memory(tmp_path, monkeypatch):
+    numbers = {"max": "3000000000\n", "current": "2900000000\n", "stat": "anon 5\ninactive_file 2800000000\n"}
+    for name, text in numbers.items():
+        (tmp_path / f"memory.{name}").write_text(text)
+    monkeypatch.setattr(environment, "LIMITS", tmp_path)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=8e9))
+    line = next(environment.check_memory())
+    assert line.state == "green" and line.found.startswith("2.9")
 
 
 def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):

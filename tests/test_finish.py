@@ -17,6 +17,7 @@ from stad_lab.evaluation import evaluate
 from stad_lab.evolution import LOG, generation_tracks
 from stad_lab.finish import FINISH, finish, finish_settings
 from stad_lab.pipeline import ship, total_budget
+from stad_lab.replication import RECORDS
 from stad_lab.search_space import load_start, search_space
 from stad_lab.settings import Settings
 from stad_lab.verify import verify
@@ -127,6 +128,11 @@ def test_a_run_that_lacks_a_file_is_refused_before_anything_is_written(missing, 
     with pytest.raises(FileNotFoundError, match=missing):
         go(folder, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_a_driver_that_has_no_controller_is_refused():
+    with pytest.raises(ValueError, match="is of gentle_driver, which has no C to go on from"):
+        finish_settings(RECORDS / "gentle_driver" / "seed0")
 
 
 def test_a_run_that_is_not_at_its_end_is_refused_before_anything_is_written(quick_run, tmp_path):

@@ -169,6 +169,18 @@ def test_a_notebook_is_committed_without_outputs_so_that_a_diff_shows_what_chang
         assert not re.search(r"!\[\s*\]\(", "".join(cell["source"])), f"{cell['id']}: a picture without words"
 
 
+@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.stem)
+def test_every_cell_that_a_page_speaks_of_is_there(page):
+    there = {
+        cell["id"]
+        for file in (ROOT / "notebooks").glob("*.ipynb")
+        for cell in json.loads(file.read_text(encoding="utf-8"))["cells"]
+    }
+    spoken_of = set(re.findall(r"\b0[0-5]-\d\d\b", page.read_text(encoding="utf-8")))
+    assert spoken_of <= there
+    assert spoken_of or page.stem != "instructor"
+
+
 @pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)
 def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     cells = json.loads(file.read_text(encoding="utf-8"))["cells"]

@@ -78,6 +78,15 @@ def test_the_loop_drives_and_pauses_with_keys_held_and_says_who_drives(make_seat
     assert seat.session.driver == seat.driver.value == "agent" and "The agent drives" in seat.status.value
 
 
+def test_the_key_changes_drivers_after_another_cell_has_given_the_wheel(make_seat):
+    seat = make_seat()
+    seat.session.give("agent")
+    seat.on_event(key("keydown", "KeyT"))
+    assert seat.session.driver == seat.driver.value == "hand"
+    seat.on_event(key("keydown", "KeyT"))
+    assert seat.session.driver == seat.driver.value == "agent"
+
+
 def test_worlds_change_while_the_agent_drives_and_the_temperature_reaches_the_dream(make_seat):
     seat = make_seat()
     seat.driver.value, seat.go.value = "agent", True

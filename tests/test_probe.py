@@ -51,6 +51,7 @@ def test_the_same_seed_gives_the_same_numbers():
         (lambda f, t, d: (f[1:], t, d), "1999 rows of features, 2000 of targets"),
         (lambda f, t, d: (f * np.nan, t, d), "not finite"),
         (lambda f, t, d: (f, t, d % 9), "9 drives: expected at least 10"),
+        (lambda f, t, d: (f, 0 * t + 1, d), "one value throughout"),
     ],
 )
 def test_rows_that_cannot_be_probed_are_refused(change, message):

@@ -49,28 +49,52 @@ def test_the_command_measures_m_against_simple_forecasts_and_lesser_m_s(measured
         assert sum(found["pit"]) == pytest.approx(1) and len(found["horizon"]["one dream"]) == len(HORIZON)
 
 
-def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_run):
+def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_run, interrupt_after):
     world_model = read_world_model(PRETRAINED / "input", "input")
     rng = np.random.default_rng(0)
     z, actions = rng.standard_normal((4, 20, 32), np.float32), rng.random((4, 20, 3), np.float32)
     arguments = (Settings.preset("quick"), quick_run / "rollouts", measured, world_model, z, actions)
     first = lesser_forecasts(*arguments)
     kept = (measured / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns
-    shutil.rmtree(measured / "no_memory")  # as if it had been stopped before
+    shutil.rmtree(measured / "no_memory")
+    hook = interrupt_after(11)  # between two checkpoints
+    with pytest.raises(KeyboardInterrupt):
+        lesser_forecasts(*arguments)
+    hook.remove()
+    assert list(measured.glob("no_memory/*.training.safetensors"))
     again = lesser_forecasts(*arguments)
     assert all(np.array_equal(first[name], again[name]) for name in CONTENDERS)
     assert (measured / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns == kept
     assert not list(measured.glob("*/*.training.safetensors"))
 
 
-def test_an_m_of_another_v_or_size_is_not_taken_for_one_of_this_study(measured, quick_run):
+def test_every_stride_and_weight_of_the_kl_is_trained_and_measured(quick_run, tmp_path, monkeypatch):
+    settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
+    drives = [record_random_drive(settings, index) for index in range(12)]
+    monkeypatch.setattr("stad_lab.study.random_drives", lambda *given: drives)
+    monkeypatch.setattr("stad_lab.study.agent_drives", lambda *given: drives)
+    monkeypatch.setattr("stad_lab.study.AGENT_SKIP", 8)
+    monkeypatch.setattr("stad_lab.study.VARIANTS", ("frame",))
+    monkeypatch.setattr("stad_lab.study.STRIDES", (1, 4))
+    monkeypatch.setattr("stad_lab.study.KL_WEIGHTS", (0.25, 4.0))
+    found = study(Settings.preset("quick"), quick_run / "rollouts", tmp_path, ["probe", "autoencoder"])
+    for driver in ("random driver", "trained agent"):
+        assert set(found["probe"]["variants"][driver]) == {"frame", "frame, untrained", "input_output, untrained"}
+        assert set(found["probe"]["strides"][driver]) == {"1", "4"}
+    assert set(found["autoencoder"]["rate_distortion"]) == {"0.25", "4"}
+    trained = {path.parent.name for path in tmp_path.glob("*/autoencoder.safetensors")}
+    assert trained == {"stride_1", "stride_4", "kl_weight_4"}  # a stride of 4 and a weight of 0.25 are the same V
+
+
+def test_an_m_of_another_v_or_of_other_settings_is_not_taken_for_one_of_this_study(measured, quick_run):
     world_model = read_world_model(PRETRAINED / "input", "input")
     rollouts, nothing = quick_run / "rollouts", np.zeros((4, 20, 32), np.float32)
     another = world_model._replace(identities=world_model.identities | {"autoencoder": "another"})
     with pytest.raises(ValueError, match=r"mdn_rnn\.safetensors was made with another autoencoder"):
         lesser_forecasts(Settings.preset("quick"), rollouts, measured, another, nothing, nothing)
-    with pytest.raises(ValueError, match="hidden_size"):
-        lesser_forecasts(Settings.preset("quick", hidden_size=9), rollouts, measured, world_model, nothing, nothing)
+    for change in ({"hidden_size": 9}, {"m_steps": 9}):
+        with pytest.raises(ValueError, match=next(iter(change))):
+            lesser_forecasts(Settings.preset("quick", **change), rollouts, measured, world_model, nothing, nothing)
 
 
 def test_a_part_that_is_measured_is_kept_if_the_next_is_interrupted(tmp_path, monkeypatch):
