@@ -216,6 +216,18 @@ WRONG = [
         "kl = lambda mu, logvar: 0.5 * (mu**2 + (logvar / 2).exp() - 1 - logvar).sum(1)",
         "the formula wants its square",
     ),
+    (
+        "02",
+        "kl-values",
+        "kl = lambda mu, s: 0.5 * (mu**2 + (2 * s).exp() - 1 - 2 * s).sum(1)",
+        "of sigma squared, not of sigma",
+    ),
+    (
+        "02",
+        "kl-values",
+        "kl = lambda mu, v: 0.5 * ((mu**2 + 1) / v.exp() - 1 + v).sum(1)",
+        "diverges from q",
+    ),
     ("02", "kl-values", "kl = lambda mu, logvar: 0.5 * (mu**2 + logvar.exp() - 1 - logvar)", "each latent by itself"),
     ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v.exp() * noise", "the variance"),
     ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v * noise", "is a logarithm"),
@@ -295,6 +307,18 @@ WRONG = [
         "the parts lie apart",
     ),
     ("03", "moments-check", "moments = lambda p, m, s: (m.mean(-1), s.mean(-1))", "weigh each mean"),
+    (
+        "03",
+        "horizon-check",
+        "horizon = lambda dream, constant: int((dream > constant).any(0).argmax()) + 1",
+        "take the sums over the drives",
+    ),
+    (
+        "03",
+        "horizon-check",
+        "horizon = lambda dream, constant: int(((dream > constant).mean(0) > 0.5).argmax()) + 1",
+        "at this step most drives err more",
+    ),
     (
         "03",
         "horizon-check",
