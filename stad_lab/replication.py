@@ -112,6 +112,12 @@ def make_rows() -> dict[str, Row]:
     for name, (about, changes, shares) in ABLATIONS.items():
         settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
         rows[name] = Row("input", about, settings, seeds=(0,), world=world)
+    rows["no_bar_frame"] = Row(
+        "frame",
+        "one round, without the bar and without difference images",
+        dataclasses.replace(one, crop_bar=True),
+        seeds=(0,),
+    )
     return rows
 
 
@@ -389,7 +395,7 @@ def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     """95% interval of the mean of returns (seeds, tracks), by a bootstrap of the seeds and of the tracks.
 
     All seeds drive the same tracks, so a track is drawn for all of them together. From three seeds the
-    interval is still too narrow (notebook 05, step 7). Agarwal et al., 2021, argue for bootstraps where runs are few.
+    interval may be too narrow (notebook 05, step 7). Agarwal et al., 2021, argue for bootstraps where runs are few.
     """
     means = resampled_means(returns, *draw_tracks(returns, resamples))
     return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]

@@ -13,7 +13,7 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.checkpoints import load_json
 from stad_lab.evolution import LOG
-from stad_lab.replication import ROWS, bootstrap, kept_rows, official_returns, stage_times, summarise
+from stad_lab.replication import ROWS, bootstrap, bootstrap_gain, kept_rows, official_returns, stage_times, summarise
 from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
@@ -100,6 +100,29 @@ def test_the_readme_s_rows_are_the_replication_s():
         counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}", f"{found['frames'] / 1e6:.2f} M"]
         scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
         assert cells(f"`{name}`") == [seeds, f"{found['worlds']}", *scores, *counts]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_the_readme_tells_the_seeds_of_every_variant_before_and_after_a_finish(variant):
+    rows, told, before = kept_rows(), [], None
+    for recipe in STAGES:
+        if f"{recipe}_{variant}" not in rows:
+            told += ["not driven yet", "", "", ""]
+            continue
+        returns, frame = (official_returns(rows[f"{recipe}_{name}"]) for name in (variant, "frame"))
+        told += [
+            ", ".join(f"{mean:.1f}" for mean in returns.mean(axis=1)),
+            f"{(returns < 800).sum()} of {returns.size}",
+        ]
+        if before is None:
+            told.append(f"{np.median(returns):.1f}")
+        else:
+            gain = returns - before[: len(returns)]
+            told.append("{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain)))
+        before = returns
+        low, high = bootstrap_gain(frame, returns)
+        told.append("" if variant == "frame" else f"{frame.mean() - returns.mean():.1f} ({-high:.1f} to {-low:.1f})")
+    assert cells(f"`{variant}`, official") == told
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
