@@ -43,7 +43,7 @@ def to_numpy(value: object) -> np.ndarray:
     try:
         return value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
     except ValueError as error:
-        raise AssertionError(f"this is no array, since its parts are not all as long ({error})") from error
+        raise AssertionError(f"this is no array, since its parts differ in length ({error})") from error
 
 
 def agree(found: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
@@ -67,7 +67,9 @@ def describe_difference(found: np.ndarray, expected: np.ndarray) -> str:
             f"found {strange.sum()} numbers that are not finite (NaN or infinite), expected {wanted.sum() or 'none'}"
             f"{elsewhere}"
         )
-    error = np.where(wanted, 0, np.abs(found.astype(float) - expected.astype(float)))
+    same = (found == expected) | np.isnan(found) & np.isnan(expected)
+    with np.errstate(invalid="ignore"):  # of infinite numbers, which are the same or not
+        error = np.where(wanted, np.where(same, 0.0, np.inf), np.abs(found.astype(float) - expected.astype(float)))
     place = tuple(int(i) for i in np.unravel_index(np.argmax(error), error.shape))
     where = f" at index {place}" if place else ""
     return f"found {found[place]:.6g}{where}, expected {expected[place]:.6g}"

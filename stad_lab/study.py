@@ -19,7 +19,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model
-from stad_lab.autoencoder import VARIANTS, AutoEncoder, kl_divergence, load_autoencoder
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, check_facts, kl_divergence, load_autoencoder
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.drives import (
     MOTION,
@@ -297,14 +297,16 @@ def lesser_forecasts(
         path = work / name.replace(" ", "_") / "mdn_rnn.safetensors"
         lesser = dataclasses.replace(settings, **changes)
         lesser = dataclasses.replace(lesser, m_batch=settings.m_batch * settings.m_sequence // lesser.m_sequence)
-        open_record(path.parent, "input", lesser, STUDY_COMMAND.format(settings.name, "mdn_rnn"))
+        record = open_record(path.parent, "input", lesser, STUDY_COMMAND.format(settings.name, "mdn_rnn"))
         if not path.exists():
             encoded = encoded or encode_rollouts(world_model.autoencoder, rollouts, settings.stride)
             torch.manual_seed(settings.seed)
             mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures)
             shown = [action * sees_actions for action in rollouts.actions]
             fit_mdn_rnn(path, mdn_rnn, "input", identity, encoded, shown, rollouts, lesser)
+            save_json(path.with_name("record.json"), record)
         mdn_rnn, facts = load_mdn_rnn(path, "input")
+        check_facts(path, facts, lesser)
         check_partner(path, facts, autoencoder=identity)
         if lesser.m_sequence > 1:
             result[name] = mixture_nll(forecast(mdn_rnn, z, actions * sees_actions), z)

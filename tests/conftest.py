@@ -87,9 +87,8 @@ def train_quickly(folder, guard):
     """Train with the quick settings under guard: what came of it, as a dictionary."""
     guard.mkdir()
     (guard / "sitecustomize.py").write_text(GUARD)
-    may_write = os.pathsep.join(
-        [str(folder), str(guard), "/dev/", "/proc/"]
-    )  # PyTorch looks for a place for temporary files
+    # PyTorch looks for a place for temporary files: in /dev/ and /proc/, too
+    may_write = os.pathsep.join([str(folder), str(guard), "/dev/", "/proc/"])
     guarded = {"GUARDED": may_write, "TMPDIR": str(guard), "PYTHONPATH": str(guard), "PYTHONDONTWRITEBYTECODE": "1"}
     begin = time.perf_counter()
     process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded)

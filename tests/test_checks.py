@@ -43,6 +43,8 @@ def test_a_wrong_answer_is_told_what_is_wrong(found, message):
         ([1.0, 2.0], [1.0, np.nan], "found 0 numbers that are not finite .*expected 1$"),
         ([np.nan, 2.0], [1.0, np.nan], "found 1 numbers that are not finite .*expected 1, elsewhere"),
         ([np.inf, np.inf], [np.nan, np.nan], r"found inf at index \(0,\), expected nan"),
+        ([1.0, np.inf], [1.0, np.nan], r"found inf at index \(1,\), expected nan"),
+        ([1.0, -np.inf], [1.0, np.inf], r"found -inf at index \(1,\), expected inf"),
         ([5.0, np.nan], [1.0, np.nan], r"found 5 at index \(0,\), expected 1"),
     ],
 )
@@ -52,7 +54,7 @@ def test_answers_that_are_not_finite_are_told_what_is_wrong(found, expected, mes
 
 
 def test_a_list_of_unequal_parts_is_told_so():
-    with pytest.raises(AssertionError, match="parts are not all as long"):
+    with pytest.raises(AssertionError, match="parts differ in length"):
         check("f(x)", [[1, 2], [3]], [[1, 2], [3, 4]])
 
 
