@@ -163,6 +163,9 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert 0.4 < failed[right].sum() / failed.sum() < 0.6
     assert not any((fast[stage, "frame"][100:] < 800)[right].any() for stage in STAGES)
     assert (failed[right].sum() - failed[25], failed.sum() - failed[25]) == (6, 18)
+    always = {v: np.flatnonzero((returns[f"two_rounds_{v}"] < 800).all(axis=0)).tolist() for v in VARIANTS}
+    assert always == {"frame": [], "input": [2, 68], "output": [2, 19], "input_output": []}
+    assert (returns["finished_input"][0, [2, 68]] < 800).all()
     both = set(right) & set(left)
     groups = [sorted(group) for group in (both, both - {25}, set(right) - both, set(left) - both)]
     assert [(failed[group].sum(), len(fast) * len(group)) for group in groups] == [(8, 32), (3, 24), (3, 48), (1, 48)]
