@@ -195,8 +195,9 @@ def plot_intervals(
                     continue
                 value, interval = contenders[row][name]
                 outside = limits is not None and value < limits[0]
-                axis.plot(interval, [place + shift] * 2, color=color, lw=2, alpha=0.5)
-                axis.plot(limits[0] if outside else value, place + shift, "<" if outside else "o", color=color, ms=5)
+                x, y = limits[0] if outside else value, place + (shift if len(contenders[row]) > 1 else 0)
+                axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.5)
+                axis.plot(x, y, "<" if outside else "o", color=color, ms=5, clip_on=not outside)
         axis.set(yticks=range(len(rows)), yticklabels=rows, ylim=(len(rows) - 0.5, -0.5))
         axis.grid(axis="x", color="0.9")
         axis.set_title(panel, fontsize=9)
