@@ -112,12 +112,8 @@ def make_rows() -> dict[str, Row]:
     for name, (about, changes, shares) in ABLATIONS.items():
         settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
         rows[name] = Row("input", about, settings, seeds=(0,), world=world)
-    rows["no_bar_frame"] = Row(
-        "frame",
-        "one round, without the bar and without difference images",
-        dataclasses.replace(one, crop_bar=True),
-        seeds=(0,),
-    )
+    about = f"{rows['no_bar'].about}, and no difference images"
+    rows["no_bar_frame"] = dataclasses.replace(rows["no_bar"], variant="frame", about=about)
     return rows
 
 
