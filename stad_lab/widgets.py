@@ -25,9 +25,9 @@ from stad_lab.plots import difference_colors, plot_moment, to_png
 Watch = Callable[[list[dict]], None]  # what a training calls with its entries so far
 
 
-def show(figure: Figure) -> HTML:
-    """A figure as a picture with its alternative text (the figure's label)."""
-    return show_picture(to_png(figure), "png", figure.get_label())
+def show(*figures: Figure) -> HTML:
+    """Figures as pictures, one below the other, each with its alternative text (the figure's label)."""
+    return HTML("".join(show_picture(to_png(figure), "png", figure.get_label()).data for figure in figures))
 
 
 def show_film(gif: bytes, alt: str) -> HTML:

@@ -1,5 +1,6 @@
 """Widgets without a browser: a moved slider draws another picture, and soon."""
 
+import re
 import time
 
 import numpy as np
@@ -62,6 +63,11 @@ def test_what_cannot_be_shown_is_refused(inside):
         moving_figure([], 10, "mp4")
     with pytest.raises(ValueError, match="no figures"):
         moving_figure([], 10)
+
+
+def test_figures_are_shown_one_below_the_other_each_with_its_own_words():
+    figures = [Figure(figsize=(1, 1), label=words) for words in ("a slow lap", "a fast lap")]
+    assert re.findall('alt="(.*?)"', show(*figures).data) == ["a slow lap", "a fast lap"]
 
 
 def test_a_picture_without_alternative_text_is_refused():
