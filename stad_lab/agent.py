@@ -5,6 +5,7 @@ and the action. C sees the mean mu of z, not a sample: driving has no use for th
 """
 
 import functools
+import math
 from pathlib import Path
 from typing import NamedTuple
 
@@ -116,7 +117,12 @@ class Agent:
 
 
 def drive(
-    agent: Agent, tracks: list[int], fast: bool = True, max_frames: int = MAX_FRAMES, patience: int = 0
+    agent: Agent,
+    tracks: list[int],
+    fast: bool = True,
+    max_frames: int = MAX_FRAMES,
+    patience: int = 0,
+    top_speed: float = math.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode on each track, all cars in step.
 
@@ -126,6 +132,7 @@ def drive(
         fast: draw observations with the fast renderer, or with Gymnasium's own.
         max_frames: cut an episode after so many frames (CarRacing's own limit is 1,000).
         patience: end an episode that has reached no new tile for so many frames; 0 for never.
+        top_speed: in world units per second; above it no gas reaches the car, and M is not told.
 
     Returns:
         The returns, float64 (tracks,), and the lengths in frames, int (tracks,).
@@ -140,6 +147,8 @@ def drive(
     while driving:
         going_on = []
         for place, (car, action) in enumerate(zip(driving, agent.act_batch(observations), strict=True)):
+            if top_speed < math.inf and envs[car].unwrapped.car.hull.linearVelocity.length > top_speed:
+                action[1] = 0.0
             observations[place], reward, terminated, truncated, _ = envs[car].step(action)
             returns[car] += reward
             lengths[car] += 1

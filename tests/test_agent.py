@@ -1,5 +1,6 @@
 """The agent: any CarRacing-v3 in, actions out, the same for one car as for many."""
 
+import math
 import shutil
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import torch
 from stad_lab import Agent, load_agent, make_env
 from stad_lab.agent import PRETRAINED, drive, load_controller, load_world_model, run_folder, save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder
+from stad_lab.car_racing import FastCarRacing
 from stad_lab.controller import parameter_count
 from stad_lab.mdn_rnn import MDNRNN
 from stad_lab.pipeline import ship
@@ -169,6 +171,22 @@ def test_cars_that_drive_in_step_end_one_by_one_with_the_returns_of_single_ones(
         alone = drive(single, [track], max_frames=120, patience=30)
         assert lengths[car] == alone[1][0]
         assert returns[car] == pytest.approx(alone[0][0], abs=1e-6)
+
+
+@pytest.mark.parametrize(("limit", "low", "high"), [(math.inf, 40, 80), (20.0, 20, 35)])  # wheels that spin push on
+def test_no_gas_reaches_a_car_above_the_top_speed(monkeypatch, limit, low, high):
+    agent, step, speeds = make_agent(), FastCarRacing.step, []
+    agent.parameters = np.zeros_like(agent.parameters)
+    agent.parameters[-2] = 20  # full gas
+
+    def watched_step(env, action):
+        found = step(env, action)
+        speeds.append(env.car.hull.linearVelocity.length)
+        return found
+
+    monkeypatch.setattr(FastCarRacing, "step", watched_step)
+    drive(agent, [4], max_frames=60, top_speed=limit)
+    assert low < max(speeds) < high
 
 
 def test_patience_ends_an_episode_that_reaches_no_new_tile():
