@@ -13,7 +13,16 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.checkpoints import load_json
 from stad_lab.evolution import LOG
-from stad_lab.replication import ROWS, bootstrap, bootstrap_gain, kept_rows, official_returns, stage_times, summarise
+from stad_lab.replication import (
+    ROWS,
+    bootstrap,
+    bootstrap_gain,
+    kept_rows,
+    official_returns,
+    stage_times,
+    summarise,
+    worlds,
+)
 from stad_lab.settings import Settings
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
@@ -166,6 +175,10 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     always = {v: np.flatnonzero((returns[f"two_rounds_{v}"] < 800).all(axis=0)).tolist() for v in VARIANTS}
     assert always == {"frame": [], "input": [2, 68], "output": [2, 19], "input_output": []}
     assert np.flatnonzero((returns["finished_input"] < 800).all(axis=0)).tolist() == [2, 19, 68]
+    good = {name for name, found in returns.items() if found.mean() > 850}
+    assert {name for name in good if returns[name][:, 19].min() > 800} == {"two_rounds_frame", "finished_frame"}
+    behind = worlds([folder for name in good for folder in rows[name] if ROWS[name].variant != "frame"])
+    assert len({autoencoder for autoencoder, _ in behind}) == 5
     assert [(returns[f"{recipe}_input"] < 800).sum() for recipe in ("two_rounds", "finished")] == [16, 15]
     assert (returns["finished_input"].mean(axis=1) > 906).sum() == 2  # and its mean is below, the README says
     both = set(right) & set(left)
