@@ -173,20 +173,24 @@ def test_cars_that_drive_in_step_end_one_by_one_with_the_returns_of_single_ones(
         assert returns[car] == pytest.approx(alone[0][0], abs=1e-6)
 
 
-@pytest.mark.parametrize(("limit", "low", "high"), [(math.inf, 40, 80), (20.0, 20, 35)])  # wheels that spin push on
-def test_no_gas_reaches_a_car_above_the_top_speed(monkeypatch, limit, low, high):
-    agent, step, speeds = make_agent(), FastCarRacing.step, []
+def test_no_gas_reaches_a_car_above_the_top_speed_and_all_below(monkeypatch):
+    agent, step, seen = make_agent(), FastCarRacing.step, []
     agent.parameters = np.zeros_like(agent.parameters)
     agent.parameters[-2] = 20  # full gas
 
     def watched_step(env, action):
-        found = step(env, action)
-        speeds.append(env.car.hull.linearVelocity.length)
-        return found
+        if action is not None:
+            seen.append((env.car.hull.linearVelocity.length, action[1]))
+        return step(env, action)
 
     monkeypatch.setattr(FastCarRacing, "step", watched_step)
-    drive(agent, [4], max_frames=60, top_speed=limit)
-    assert low < max(speeds) < high
+    for limit in (math.inf, 20.0):
+        seen.clear()
+        drive(agent, [4], max_frames=60, top_speed=limit)
+        speed, gas = np.array(seen).T
+        assert (gas[speed <= limit] > 0.9).all()
+        assert (gas[speed > limit] == 0).all()
+        assert len(seen) == 60 and (speed > 20).any()
 
 
 def test_patience_ends_an_episode_that_reaches_no_new_tile():
