@@ -188,6 +188,25 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
 
 
+def test_the_words_on_single_changes_hold_for_the_records():
+    rows = kept_rows()
+    base, *changed = (official_returns(rows[name]) for name in ("one_round", "no_M", "no_z", "untrained_M"))
+    low, high = base.mean(axis=1).min(), base.mean(axis=1).max()
+    assert all(low < found.mean() < high for found in changed)
+    gains = [f"{found.mean() - base.mean():.1f}" for found in changed]
+    assert f"{gains[0]}, {gains[1]} and {gains[2]} points more, all three among the searches of `one_round`" in README
+    assert f"Its three searches, on one V and M, have {', '.join(f'{m:.1f}' for m in base.mean(axis=1)[:2])}" in README
+    no_bar, two_rounds = (official_returns(rows[name]) for name in ("no_bar", "two_rounds_input"))
+    assert no_bar.mean() < low
+    worse = [base.mean() - no_bar.mean(), *(-bound for bound in reversed(bootstrap_gain(base, no_bar)))]
+    assert "{:.1f} points less ({:.0f} to {:.0f})".format(*worse) in README
+    better = [two_rounds.mean() - base.mean(), *np.abs(bootstrap_gain(base, two_rounds))]
+    assert "{:.1f} points above `one_round` ({:.1f} below to {:.1f} above)".format(*better) in README
+    scatter = [round(float(np.ptp(found.mean(axis=1)))) for found in (two_rounds, base)]
+    laps = [round(100 * float((found >= 900).mean())) for found in (two_rounds, base)]
+    assert (scatter, laps) == ([21, 59], [93, 75])
+
+
 def test_the_readme_s_times_are_those_of_whole_runs_and_keep_the_promise():
     runs = {"no_bar": "laptop", "paper_input": "paper"}
     assert all(ROWS[name].settings == Settings.preset(preset) for name, preset in runs.items())
