@@ -78,6 +78,10 @@ class WorkerProcesses(Executor):
         """End the processes at once, whatever they do."""
         for process in self._processes():
             process.kill()
+        # Who dies while sending a result leaves half of it, and the pool's reader waits for the rest for as long as
+        # anybody could still write it: for ever, because this process holds that end of the pipe as well.
+        if results := self.pool._result_queue:
+            results._writer.close()
 
     def _processes(self) -> list[multiprocessing.Process]:
         return list((self.pool._processes or {}).values())  # there is no public way to them

@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 
@@ -44,6 +46,29 @@ def test_the_workers_of_all_pools_come_from_one_process_that_has_imported_the_li
         assert 50 < peak_memory(executor)["worker"] < 3000
     assert parents[0] == parents[1]
     assert "worker" not in peak_memory()
+
+
+def send_much():
+    """A task whose result is a long while on its way to the parent."""
+    return bytes(300_000_000)
+
+
+def test_an_interrupt_while_a_worker_sends_its_result_does_not_hang():
+    ends = []
+
+    def interrupted():
+        with pytest.raises(KeyboardInterrupt), worker_processes(1) as executor:
+            executor.submit(send_much)
+            while not executor.pool._result_queue._reader.poll(0.001):
+                pass
+            time.sleep(0.01)  # some of it has come
+            raise KeyboardInterrupt
+        ends.append("at once")
+
+    thread = threading.Thread(target=interrupted, daemon=True)
+    thread.start()
+    thread.join(60)
+    assert ends == ["at once"]
 
 
 @pytest.mark.skipif(not has_glibc(), reason="only glibc is told to keep memory")
