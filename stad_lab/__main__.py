@@ -27,7 +27,8 @@ from stad_lab.evaluation import describe, evaluate
 from stad_lab.finish import FINISH, OPEN, finish, finish_settings
 from stad_lab.parallel import TaskError
 from stad_lab.pipeline import STAGES, ship, train
-from stad_lab.replication import FLOORS, ROWS, describe_forecast, describe_row, forecast, keep, replicate
+from stad_lab.replication import describe_forecast, describe_row, forecast, keep, replicate
+from stad_lab.rows import FLOORS, ROWS
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
 from stad_lab.study import study

@@ -24,9 +24,9 @@ from stad_lab.evolution import evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import TaskError, run_tasks, worker_processes
 from stad_lab.pipeline import STAGES, train
-from stad_lab.replication import RECORDS
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
+from stad_lab.table import RECORDS
 from stad_lab.verify import verify
 
 KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # on Windows, SIGTERM ends a process at once

@@ -17,9 +17,10 @@ from stad_lab.evaluation import evaluate
 from stad_lab.evolution import LOG, generation_tracks
 from stad_lab.finish import FINISH, finish, finish_settings
 from stad_lab.pipeline import ship, total_budget
-from stad_lab.replication import RECORDS
+from stad_lab.rows import ROWS, Row
 from stad_lab.search_space import load_start, search_space
 from stad_lab.settings import Settings
+from stad_lab.table import RECORDS, learning_curve, summarise
 from stad_lab.verify import verify
 
 VARIANT = "input_output"
@@ -169,8 +170,8 @@ def test_the_command_finishes_a_run_and_its_record_says_how(finished, quick_run,
 def test_a_row_of_finishes_goes_on_from_the_seeds_of_its_base(monkeypatch, tmp_path):
     settings = Settings.preset("quick", processes=1, generations=2, v_steps=8, m_steps=4)
     last = Settings.from_dict(settings.as_dict() | FINISH | BRIEF | {"generations": 2})
-    monkeypatch.setitem(replication.ROWS, "first", replication.Row("input", "before", settings, seeds=(0, 1)))
-    monkeypatch.setitem(replication.ROWS, "last", replication.Row("input", "after", last, seeds=(0, 1), base="first"))
+    monkeypatch.setitem(ROWS, "first", Row("input", "before", settings, seeds=(0, 1)))
+    monkeypatch.setitem(ROWS, "last", Row("input", "after", last, seeds=(0, 1), base="first"))
     monkeypatch.setattr(replication, "TRACKS", 1)
     monkeypatch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
     with ThreadPoolExecutor(1) as executor:
@@ -181,7 +182,7 @@ def test_a_row_of_finishes_goes_on_from_the_seeds_of_its_base(monkeypatch, tmp_p
     assert (tmp_path / "first" / "seed1" / LOG).stat().st_mtime_ns == before
     log = load_json(tmp_path / "last" / "seed1" / LOG)
     assert log["settings"]["evolution_seed"] == 1 and log["settings"]["tracks"] == 2
-    base = replication.summarise([tmp_path / "first" / "seed1"])
+    base = summarise([tmp_path / "first" / "seed1"])
     assert found["agents"] == base["agents"] + 2 * 4 and found["episodes"] == base["episodes"] + 2 * 4 * 2 + 2
-    episodes, scores = replication.learning_curve(tmp_path / "last" / "seed1")
+    episodes, scores = learning_curve(tmp_path / "last" / "seed1")
     assert episodes.tolist() == [found["episodes"]] and len(scores) == 1

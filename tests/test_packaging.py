@@ -42,6 +42,8 @@ ROOMS = [
     "cluster",
     "study",
     "benchmark",
+    "rows",
+    "table",
     "replication",
     "plots",
     "film",

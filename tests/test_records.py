@@ -13,17 +13,9 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.checkpoints import load_json
 from stad_lab.evolution import LOG
-from stad_lab.replication import (
-    ROWS,
-    bootstrap,
-    bootstrap_gain,
-    kept_rows,
-    official_returns,
-    stage_times,
-    summarise,
-    worlds,
-)
+from stad_lab.rows import ROWS
 from stad_lab.settings import Settings
+from stad_lab.table import bootstrap, bootstrap_gain, kept_rows, official_returns, stage_times, summarise, worlds
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
 README = (Path(__file__).parent.parent / "README.md").read_text()

@@ -14,24 +14,19 @@ from stad_lab.evaluation import evaluate
 from stad_lab.evolution import LOG, fitness_curves
 from stad_lab.pipeline import starts, total_budget
 from stad_lab.plots import plot_curves, plot_episodes, plot_intervals, plot_returns, plot_seeds, plot_stacks
-from stad_lab.replication import (
-    FLOORS,
-    ROWS,
+from stad_lab.replication import describe_forecast, forecast, keep, replicate
+from stad_lab.rows import FLOORS, ROWS, Row
+from stad_lab.settings import Settings
+from stad_lab.table import (
     WORLD_MODELS,
-    Row,
     bootstrap,
     bootstrap_gain,
-    describe_forecast,
-    forecast,
-    keep,
     kept_rows,
     learning_curve,
     lost_points,
-    replicate,
     stage_times,
     summarise,
 )
-from stad_lab.settings import Settings
 
 TINY = {"processes": 1, "generations": 2, "v_steps": 8, "m_steps": 4}
 FIRST = Settings.preset("quick", **TINY)

@@ -1,0 +1,147 @@
+"""The table of the replication: what the records of its rows say, and how sure that is.
+
+The records that we report lie in `stad_lab/records/table`, a folder for each row as `stad_lab.replication` has it.
+"""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from stad_lab.checkpoints import load_json
+from stad_lab.evaluation import SOLVED
+from stad_lab.evaluation import summarise as summarise_episodes
+from stad_lab.evolution import LOG
+from stad_lab.pipeline import total_budget
+from stad_lab.rows import FLOORS, ROWS
+
+RECORDS = Path(__file__).parent / "records" / "table"
+# World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
+WORLD_MODELS = {25 * 64 * 16: 823.0, 50 * 64 * 16: 867.0, 200 * 64 * 16: 880.0, 1800 * 64 * 16: 900.5}
+PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # its table, on CarRacing-v0
+TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
+RESAMPLES = 10_000
+
+
+def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
+    """The rows that have been made: name -> folders of its seeds, in the order of FLOORS and ROWS."""
+    found = {name: sorted((records / name).glob("seed*")) for name in [*FLOORS, *ROWS]}
+    return {name: folders for name, folders in found.items() if folders}
+
+
+def stage_times(row: Path) -> dict[str, float]:
+    """How long the stages of a row took, from nothing to the evaluated agent of seed 0, in seconds.
+
+    Args:
+        row: folder of a row that has a world of its own. The stages of a first round count too.
+
+    Returns:
+        "rollouts", "autoencoder", "mdn_rnn", "controller" and "evaluation" -> seconds.
+    """
+    times: Counter[str] = Counter()
+    for part in ("first", "world", "seed0") if (row / "first").exists() else ("world", "seed0"):
+        times.update(load_json(row / part / "record.json")["seconds"])
+    return dict(times) | {"evaluation": load_json(row / "seed0" / "evaluation.json")["seconds"]}
+
+
+def lost_points(folders: list[Path]) -> dict[str, float]:
+    """Where the points up to 1,000 went, mean of all episodes: 1,000 less the sum of the parts is the mean return.
+
+    Returns:
+        "speed": 0.1 for each frame of a lap, had every episode been a complete lap at the mean time of those that were.
+        "waiting": 0.1 for each frame more. A lap ends when all tiles are visited, so that one missed tile prolongs the
+        episode to its last frame; only leaving the field shortens it. "tiles": those not visited, and the 100 points
+        for leaving the field.
+    """
+    episodes = [episode for folder in folders for episode in load_json(folder / "evaluation.json")["episodes"]]
+    returns, frames = (np.array([episode[name] for episode in episodes]) for name in ("return", "frames"))
+    laps = frames[returns >= SOLVED]  # 1,000 frames at most, so 900 points at least; and with a tile missing, fewer
+    speed = laps.mean() if len(laps) else frames.mean()
+    return {
+        "speed": float(0.1 * speed),
+        "waiting": float(0.1 * (frames.mean() - speed)),
+        "tiles": float((1000 - returns - 0.1 * frames).mean()),
+    }
+
+
+def learning_curve(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """The scores on the validation tracks of one seed, and how many episodes had been driven for each: two (looks,).
+
+    All episodes count: the random driver's, those of a first round and of its agent, and the validation itself.
+    """
+    log, record = load_json(folder / LOG)["generations"], load_json(folder / "record.json")
+    own = sum(record["budget"][part]["episodes"] for part in ("evolution", "validation"))
+    driven, episodes, scores = total_budget(record)["episodes"] - own, [], []
+    for entry in log:
+        driven += sum(len(returns) for returns in entry["returns"])
+        if "validation" in entry:
+            driven += len(entry["validation"]["returns"])
+            episodes.append(driven)
+            scores.append(entry["validation"]["mean"])
+    return np.array(episodes), np.array(scores)
+
+
+def summarise(folders: list[Path]) -> dict:
+    """What the table shows of a row, from the folders of its seeds.
+
+    Returns:
+        "mean", "standard_deviation" (over all episodes), "interval" (95%, of the mean, over seeds and tracks), "seeds"
+        (the mean of each), "worlds" (how many trainings of V and M are behind them), "above_900" (share of episodes),
+        "top_90" (mean of each seed's best 90 episodes), and the budget of one seed: "agents", "episodes", "frames"
+        (means over the seeds), with all that was driven before it.
+    """
+    returns = official_returns(folders)
+    budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
+    return {
+        **summarise_episodes(returns.ravel()),
+        "interval": bootstrap(returns),
+        "seeds": returns.mean(axis=1).tolist(),
+        "worlds": len(worlds(folders)),
+        "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
+        **{unit: float(np.mean([spent[unit] for spent in budgets])) for unit in ("agents", "episodes", "frames")},
+    }
+
+
+def worlds(folders: list[Path]) -> set[tuple[str, str]]:
+    """The identities of the V's and M's that the searches in some folders had; none of a driver of FLOORS."""
+    logs = [load_json(folder / LOG) for folder in folders if (folder / LOG).exists()]
+    return {(log["autoencoder"], log["mdn_rnn"]) for log in logs}
+
+
+def official_returns(folders: list[Path]) -> np.ndarray:
+    """The returns of a row's seeds on the official tracks, float64 (seeds, tracks), from their folders."""
+    evaluations = [load_json(folder / "evaluation.json", "evaluate again") for folder in folders]
+    return np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
+
+
+def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
+    """95% interval of the mean of returns (seeds, tracks), by a bootstrap of the seeds and of the tracks.
+
+    All seeds drive the same tracks, so a track is drawn for all of them together. From three seeds the
+    interval may be too narrow (notebook 05, step 7). Agarwal et al., 2021, argue for bootstraps where runs are few.
+    """
+    means = resampled_means(returns, *draw_tracks(returns, resamples))
+    return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
+
+
+def bootstrap_gain(before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
+    """95% interval of the mean of `after` less the mean of `before`, both returns (seeds, tracks) on the same tracks.
+
+    Seeds are drawn anew for each of the two, tracks once for both: a long track costs both of them time. Of a row with
+    one seed the luck of its search is left out, so that the interval is too narrow.
+    """
+    rng, tracks = draw_tracks(before, resamples)
+    gains = resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks)
+    return [float(bound) for bound in np.percentile(gains, [2.5, 97.5])]
+
+
+def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generator, np.ndarray]:
+    """The Generator of a bootstrap, and the tracks of each resample, int (resamples, 1, tracks)."""
+    rng, tracks = np.random.default_rng(0), returns.shape[1]
+    return rng, rng.integers(tracks, size=(resamples, 1, tracks))
+
+
+def resampled_means(returns: np.ndarray, rng: np.random.Generator, tracks: np.ndarray) -> np.ndarray:
+    """The mean return of each resample, float64 (resamples,), with seeds drawn here."""
+    seeds = rng.integers(len(returns), size=(len(tracks), len(returns), 1))
+    return returns[seeds, tracks].mean(axis=(1, 2))
