@@ -174,7 +174,7 @@ def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldM
     new = {"variant": variant, "settings": settings.as_dict(), **world_model.identities, "best": None}
     if not (folder / LOG).exists():
         return new | {"generations": []}
-    log = load_json(folder / LOG, "evolve C again")
+    log = load_json(folder / LOG, f"evolve C again, with {CONTROLLER} moved away, too")
     made = {"variant": log["variant"], **log["settings"]}
     check_same_run(folder / LOG, made, {"variant": variant, **new["settings"]})
     check_partner(folder / LOG, log, **world_model.identities)

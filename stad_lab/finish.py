@@ -5,8 +5,8 @@ lose hundreds of points on one in twenty counts in as few generations. In a fini
 in their mean a single failure weighs more than all that haste can gain. That costs eight times the episodes for an
 agent, so it is kept for the end, when small steps from a good C are enough. Nothing is collected or trained.
 
-Tracks and mutations are drawn with the seeds of the earlier run, by the number of the generation: of four new tracks of
-a generation, the first is one that it has driven as well.
+Tracks and mutations are drawn with the seeds of the earlier run, by the number of the generation: where that run drove
+a new track in a generation of this number, it is the first of the new ones here.
 """
 
 from concurrent.futures import Executor
@@ -17,8 +17,8 @@ import torch
 from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.autoencoder import check_variant
 from stad_lab.checkpoints import copy_file, load_json, locked, save_tensors
-from stad_lab.evolution import CONTROLLER, LOG, evolve
-from stad_lab.pipeline import EARLIER, open_record, run_stages, set_options
+from stad_lab.evolution import CONTROLLER, evolve
+from stad_lab.pipeline import EARLIER, open_record, read_finished, run_stages, set_options
 from stad_lab.search_space import COMPONENTS, START, load_directions, load_start
 from stad_lab.settings import Settings
 
@@ -76,12 +76,7 @@ def finish(
     command = f"python -m stad_lab finish --variant {variant} --path ... --out ..."
     command += set_options(settings, finish_settings(earlier))
     with locked(folder):
-        record = open_record(folder, variant, settings, command, earlier)
-        if record.get("earlier") != before:
-            raise ValueError(
-                f"{folder} does not hold a finish of {earlier} as it is now: choose another folder, or give the run"
-                " that it goes on from"
-            )
+        record = open_record(folder, variant, settings, command, before)
         return run_stages(stages, ["controller"], record, folder, None, executor)
 
 
@@ -98,13 +93,7 @@ def check_earlier(variant: str, settings: Settings, earlier: Path) -> dict:
     load_agent(variant, earlier)
     if settings.components:
         load_directions(earlier / COMPONENTS, read_world_model(earlier, variant))
-    log, whole = load_json(earlier / LOG, EARLIER)["generations"], was["generations"] * was["population"]
-    if len(log) != was["generations"] or record.get("budget", {}).get("agents") != whole:
-        raise ValueError(
-            f"the search in {earlier} is not at its end, with {len(log)} of {was['generations']} generations: run its"
-            " own command to the end first"
-        )
-    return record
+    return read_finished(earlier)
 
 
 def begin_finish(variant: str, earlier: Path, folder: Path) -> bool:

@@ -11,7 +11,8 @@ The folder of a run::
     start.safetensors             only in a second round or a finish: the earlier run's C, for the V and M here
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
                                   stage, and the most memory that a process has held by its end (in MB, for each start);
-                                  of a start that was killed, its time and that it was are missing
+                                  of a start that was killed, or that a full disk or a refused file has ended, its
+                                  time and that it was are missing
 """
 
 import importlib.metadata
@@ -70,7 +71,8 @@ def train(
 
     Raises:
         ValueError: an unknown variant or stage, a folder with a run of another variant or other settings, or with a
-            file that is damaged or belongs to another run, or an earlier run whose V has seen the bar otherwise.
+            file that is damaged or belongs to another run, or an earlier run whose V has seen the bar otherwise, that
+            is not at its end, or that is not as it was when this second round began.
         OSError: another process works in the folder, or a file cannot be read or written.
         TaskError, FloatingPointError: as raised by the stages.
     """
@@ -84,6 +86,7 @@ def train(
         )
     if earlier is not None:
         check_earlier_v(variant, settings, Path(earlier))
+    before = read_finished(Path(earlier)) if earlier is not None else None
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
     stages = {
@@ -100,7 +103,7 @@ def train(
         search = stages["controller"]
         stages["controller"] = lambda pool: carry_over(*again, folder) | search(pool)
     with locked(folder):
-        record = open_record(folder, variant, settings, command_of(variant, settings), earlier)
+        record = open_record(folder, variant, settings, command_of(variant, settings), before)
         return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder, executor)
 
 
@@ -136,15 +139,35 @@ def run_stages(
     return worked
 
 
-def open_record(
-    folder: Path, variant: str, settings: Settings, command: str, earlier: str | Path | None = None
-) -> dict:
-    """The record of the run in `folder`, or a new one; that of a second round or a finish holds the earlier run's.
+def read_finished(earlier: Path) -> dict:
+    """The record of a run, whose search for C must be at its end.
+
+    Raises:
+        ValueError: it is not, or a file is damaged.
+        FileNotFoundError: there is no run, or no log of a search.
+    """
+    record = load_json(earlier / "record.json", EARLIER)
+    log, settings = load_json(earlier / LOG, EARLIER)["generations"], record["settings"]
+    whole = settings["generations"] * settings["population"]
+    if len(log) != settings["generations"] or record.get("budget", {}).get("agents") != whole:
+        raise ValueError(
+            f"the search in {earlier} is not at its end, with {len(log)} of {settings['generations']} generations: run"
+            " its own command to the end first"
+        )
+    return record
+
+
+def open_record(folder: Path, variant: str, settings: Settings, command: str, earlier: dict | None = None) -> dict:
+    """The record of the run in `folder`, or a new one.
+
+    Args:
+        earlier: the record of the run that a second round, or a finish, goes on from; this one's holds it.
 
     What it was "made_with" stays that of the first start; a later one by other means adds to "continued_with".
 
     Raises:
-        ValueError: the folder holds a run of another variant or of other settings.
+        ValueError: the folder holds a run of another variant or of other settings, or one that went on from another
+            run, or from the same when it was less far.
     """
     path = folder / "record.json"
     if not path.exists():
@@ -155,13 +178,18 @@ def open_record(
             "seconds": {},
         }
         if earlier is not None:
-            record["earlier"] = load_json(Path(earlier) / "record.json", EARLIER)
+            record["earlier"] = earlier
         save_json(path, record)
         return record
     record = load_json(path)
     check_same_run(
         path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
     )
+    if record.get("earlier") != earlier:
+        raise ValueError(
+            f"{folder} holds a run that does not go on from the one given as it is now: choose another folder, or give"
+            " the run that it goes on from"
+        )
     made = provenance(command)
     if made != starts(record)[-1]:
         record["continued_with"] = [*starts(record)[1:], made]

@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 from stad_lab.autoencoder import AutoEncoder, load_autoencoder, save_autoencoder
 from stad_lab.benchmark import train_m, train_v
 from stad_lab.car_racing import make_env
-from stad_lab.checkpoints import copy_file, load_json, save_json
+from stad_lab.checkpoints import checksum, copy_file, load_json, save_json
 from stad_lab.controller import initial_parameters, squash
 from stad_lab.evaluation import SOLVED, evaluate, report
 from stad_lab.evolution import CONTROLLER, LOG, drive_generation
@@ -69,7 +69,8 @@ def replicate(
         finish_row(row, folder, folders, executor)
     elif row.retrained:
         for seed, own in folders.items():
-            evaluate_row(row, own, train(row.variant, row.settings_of(seed), own, executor=executor), executor)
+            train(row.variant, row.settings_of(seed), own, executor=executor)
+            evaluate_row(row, own, executor)
     else:
         first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
         for seed, own in folders.items():
@@ -121,8 +122,8 @@ def finish_row(row: Row, folder: Path, folders: dict[int, Path], executor: Execu
             replicate(row.base, folder, executor, [seed])
         searches = [one.settings_of(seed) for one in (ROWS[row.base], row)]
         check_same_run(base, load_json(base / "record.json")["settings"], searches[0].as_dict())
-        worked = finish(row.variant, searches[1], base, own, executor)
-        evaluate_row(row, own, worked, executor)
+        finish(row.variant, searches[1], base, own, executor)
+        evaluate_row(row, own, executor)
 
 
 def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path | None, Path]:
@@ -146,14 +147,15 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
     for source in made:
         if not (folder / source.name).exists():
             copy_file(source, folder)
-    worked = train(row.variant, row.settings_of(seed), folder, world / "rollouts", executor=executor, earlier=first)
-    evaluate_row(row, folder, worked, executor)
+    train(row.variant, row.settings_of(seed), folder, world / "rollouts", executor=executor, earlier=first)
+    evaluate_row(row, folder, executor)
 
 
-def evaluate_row(row: Row, folder: Path, worked: bool, executor: Executor | None) -> None:
-    """Drive what a search found on the official tracks, and write `evaluation.json`, if it is new or was not driven."""
-    if worked or not (folder / "evaluation.json").exists():
-        save_json(folder / "evaluation.json", evaluate(row.variant, folder, TRACKS, executor=executor))
+def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
+    """Drive what a search found on the official tracks, and write `evaluation.json`, if that does not tell of it."""
+    path, found = folder / "evaluation.json", checksum((folder / CONTROLLER).read_bytes())
+    if not path.exists() or load_json(path, "run the same command again")["controller_sha256"] != found:
+        save_json(path, evaluate(row.variant, folder, TRACKS, executor=executor))
 
 
 def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
@@ -202,8 +204,8 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
         return times | {"finishes": times["searches"] * longer, "evaluations": 2 * times["evaluations"]}
     with tempfile.TemporaryDirectory() as folder:
         speed = speeds(row, Path(folder))
-    runs = len(row.seeds) if row.retrained else 1
-    rounds = [row.first, row.settings] if row.first else [row.settings] * runs
+    made = ROWS[row.world] if row.world else row
+    rounds = [made.first, made.settings] if made.first else [made.settings] * (len(row.seeds) if row.retrained else 1)
     return {
         "rollouts": sum(s.episodes * s.episode_frames + s.agent_episodes * s.max_frames for s in rounds)
         / speed["V, M, C"],

@@ -19,13 +19,14 @@ from stad_lab.evolution import (
     LOG,
     check_space,
     drive_group,
+    hand_out,
     kept_generation,
     read_log,
     replay,
     validate,
 )
 from stad_lab.mdn_rnn import load_mdn_rnn
-from stad_lab.parallel import run_tasks, worker_processes
+from stad_lab.parallel import TaskError, run_tasks, worker_processes
 from stad_lab.pipeline import EARLIER, MACHINE, PACKAGES, provenance, starts
 from stad_lab.rollouts import Rollouts
 from stad_lab.search_space import search_space
@@ -79,7 +80,7 @@ def outcome(check: Callable[[], str], excuse: str) -> str:
         return check()
     except NotRepeated as error:
         return f"differs: {error}; but {excuse}" if excuse else f"FAILED: {error}"
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, TaskError) as error:
         return f"FAILED: {error}"
 
 
@@ -164,21 +165,23 @@ def drive_again(folder: Path, variant: str, settings: Settings, executor: Execut
     """Drive recorded episodes again: of an official evaluation, or of another, or of the last look at validation."""
     if not (folder / CONTROLLER).exists():
         return f"none: {NOT_HERE}"
-    parameters, facts = load_controller(folder / CONTROLLER, variant)
+    parameters, _ = load_controller(folder / CONTROLLER, variant)
     evaluations = [load_json(file) for file in sorted(folder.glob("evaluation*.json"))]
     evaluations.sort(key=lambda evaluation: evaluation["renderer"] != "official")
     with worker_processes(settings.processes, executor) as executor:
+        source = hand_out(executor, folder, variant)
         if evaluations:
             episodes, fast = evaluations[0]["episodes"], evaluations[0]["renderer"] == "fast"
             chosen = [episodes[n] for n in np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)]
             recorded = [episode["return"] for episode in chosen]
-            tasks = [(folder, variant, parameters, [episode["track"]], fast, None) for episode in chosen]
+            tasks = [(source, variant, parameters, [episode["track"]], fast, None) for episode in chosen]
             found = dict(run_tasks(executor, drive_group, tasks))
             driven = [float(found[n][0][0]) for n in range(len(tasks))]
         else:  # all the tracks, because last bits depend on the cars that drive in step
-            looks = load_json(folder / LOG)["generations"][facts["generation"] - 1]
-            recorded = looks["validation"]["returns"][:AGAIN]
-            driven = validate(executor, folder, variant, settings, parameters)["returns"][:AGAIN]
+            log = read_log(variant, settings, folder, read_world_model(folder, variant))
+            look = log["generations"][kept_generation(variant, folder, log) - 1]
+            recorded = look["validation"]["returns"][:AGAIN]
+            driven = validate(executor, source, variant, settings, parameters)["returns"][:AGAIN]
     if driven != recorded:
         raise NotRepeated(f"the record says {recorded}, now it was {driven}")
     return f"ok: {', '.join(f'{value:.1f}' for value in driven)} points, to the last bit as recorded"

@@ -472,6 +472,18 @@ def test_verify_finds_a_return_that_no_drive_gives(quick_run, tmp_path, in_this_
     assert re.match(r"differs: .*; but processor is '.*' and was 'a processor with", drives)
 
 
+def test_verify_tells_of_a_controller_that_the_log_does_not_know_beside_all_that_is_well(
+    quick_run, tmp_path, in_this_process
+):
+    folder = shutil.copytree(quick_run, tmp_path / "run")
+    log = load_json(folder / "evolution.json")
+    save_json(folder / "evolution.json", log | {"generations": log["generations"][:1]})
+    found = verify(folder, in_this_process)
+    assert found["rollouts"].startswith("ok")
+    for part in ("C", "drives"):
+        assert "does not come from the run that" in found[part] and found[part].startswith("FAILED")
+
+
 def test_verify_says_of_a_driver_without_an_agent_that_there_is_nothing_to_verify(capsys):
     assert main(["verify", str(RECORDS / "random_driver" / "seed0")]) == 2
     assert "random_driver, which has no V, M and C: there is nothing to verify" in capsys.readouterr().err

@@ -149,7 +149,9 @@ def test_a_finish_of_another_run_is_not_taken_for_this_one(finished, quick_run, 
     other = shutil.copytree(quick_run, tmp_path / "other", ignore=shutil.ignore_patterns("rollouts"))
     record = load_json(other / "record.json")
     save_json(other / "record.json", record | {"seconds": {}})
-    with pytest.raises(ValueError, match=r"does not hold a finish of .*other as it is now: choose another folder"):
+    with pytest.raises(
+        ValueError, match=r"holds a run that does not go on from the one given as it is now: choose another"
+    ):
         go(other, finished)
 
 

@@ -106,6 +106,15 @@ def test_a_lost_evaluation_is_driven_again_to_the_same_numbers(table):
     assert replicate("two", folder) == summaries["two"]
 
 
+def test_an_evaluation_of_another_controller_is_driven_again(table):
+    folder, summaries = table
+    path = folder / "two" / "seed1" / "evaluation.json"
+    whole = load_json(path)
+    save_json(path, whole | {"controller_sha256": "of an earlier one", "episodes": []})
+    assert replicate("two", folder) == summaries["two"]
+    assert load_json(path)["controller_sha256"] == whole["controller_sha256"]
+
+
 def test_the_summary_counts_every_episode_that_was_driven_for_a_seed(table):
     folder, summaries = table
     record = load_json(folder / "two" / "seed0" / "record.json")
@@ -276,6 +285,7 @@ def test_some_seeds_of_a_row_can_be_made_alone(table, monkeypatch):
     base, finished = (forecast(f"{recipe}_frame", seeds=[0]) for recipe in ("two_rounds", "finished"))
     longer = (15 * 32 * 8 + 3 * 16) / (40 * 64 + 8 * 16)
     assert finished == base | {"finishes": base["searches"] * longer, "evaluations": 2 * base["evaluations"]}
+    assert forecast("untrained_M")["M"] == whole["M"] > 0  # the world that it shares has a trained M
 
 
 def test_the_command_keeps_what_is_finished(tmp_path, capsys):

@@ -11,6 +11,7 @@ from safetensors.numpy import load_file
 
 from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.checkpoints import load_json, save_json
+from stad_lab.evolution import LOG
 from stad_lab.pipeline import ship, total_budget, train
 from stad_lab.rollouts import Rollouts, drive_randomly
 from stad_lab.search_space import features, load_start
@@ -68,6 +69,22 @@ def test_a_second_round_that_would_see_the_bar_otherwise_is_refused_before_any_w
     with pytest.raises(ValueError, match=f"crop_bar={other.crop_bar}, but the run in .*={SETTINGS.crop_bar}: set that"):
         train(VARIANT, other, tmp_path / "run", earlier=quick_run)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_first_round_that_is_not_at_its_end_is_refused_before_any_work(quick_run, tmp_path):
+    folder = shutil.copytree(quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("rollouts"))
+    log = load_json(folder / LOG)
+    save_json(folder / LOG, log | {"generations": log["generations"][:2]})
+    with pytest.raises(ValueError, match=r"is not at its end, with 2 of 4 generations: run its own command to the end"):
+        train(VARIANT, SETTINGS, tmp_path / "run", earlier=folder)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_second_round_goes_on_only_from_the_first_as_it_was(second, quick_run, tmp_path):
+    other = shutil.copytree(quick_run, tmp_path / "other", ignore=shutil.ignore_patterns("rollouts"))
+    save_json(other / "record.json", load_json(other / "record.json") | {"seconds": {}})
+    with pytest.raises(ValueError, match="holds a run that does not go on from the one given as it is now"):
+        train(VARIANT, SETTINGS, second, earlier=other)
 
 
 def test_an_unsteady_hand_differs_between_episodes_and_m_remembers_what_was_done(agent, quick_run):
