@@ -271,7 +271,7 @@ def main(arguments: list[str] | None = None) -> int:
             print(f"every measurement: {file}")
         elif options.command == "benchmark":
             check_writable(options.json)
-            save_json(options.json, benchmark(options.part or list(PARTS), options.rounds))
+            benchmark(options.part or list(PARTS), options.rounds, options.json)
             print(f"\nevery measurement: {options.json}")
         elif options.command == "ship":
             print(f"shipped to {ship(options.variant, options.path)}")

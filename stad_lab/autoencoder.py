@@ -19,7 +19,7 @@ import torch
 from torch import nn
 
 from stad_lab.checkpoints import checksum_of_tensors, load_into, load_tensors, locked, save_tensors
-from stad_lab.rollouts import Rollouts
+from stad_lab.rollouts import Rollouts, check_seen
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import fit, training_device
 
@@ -218,9 +218,12 @@ def train_autoencoder(
         FloatingPointError: the loss is not finite.
     """
     path = Path(folder) / "autoencoder.safetensors"
+    checkpoint = path.with_name("autoencoder.training.safetensors")
     if path.exists():
         facts = load_autoencoder(path, variant)[1]
         check_facts(path, facts, settings)
+        check_seen(path, facts["rollouts"], rollouts_folder)
+        checkpoint.unlink(missing_ok=True)  # of a process that was killed before it did
         if watch:
             watch(facts["history"])
         return False
@@ -250,14 +253,13 @@ def train_autoencoder(
         weights = [len(part) for part in parts]
         return {name: float(np.average([loss[name].item() for loss in found], weights=weights)) for name in found[0]}
 
-    checkpoint = path.with_name("autoencoder.training.safetensors")
     label = f"train V ({variant})"
     identity = {"part": "autoencoder", "variant": variant, "rollouts": rollouts.identity, **settings.as_dict()}
     steps, rate = settings.v_steps, settings.v_learning_rate
     with locked(path.parent):
         history = fit(autoencoder, batch, losses, heldout_losses, steps, rate, checkpoint, label, identity, watch)
         save_autoencoder(path, autoencoder, settings, history, rollouts.identity)
-        checkpoint.unlink()
+        checkpoint.unlink(missing_ok=True)  # there is none after 0 steps
     return True
 
 

@@ -16,7 +16,6 @@ import functools
 import importlib.metadata
 import importlib.util
 import multiprocessing
-import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -34,12 +33,13 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm.auto import tqdm
 
 from stad_lab.agent import PRETRAINED, Agent, drive, load_agent, read_world_model
-from stad_lab.autoencoder import AutoEncoder, autoencoder_losses, save_autoencoder, to_pictures
+from stad_lab.autoencoder import AutoEncoder, autoencoder_losses, load_autoencoder, save_autoencoder, to_pictures
 from stad_lab.car_racing import BAR_TOP, HULL_COLUMN, HULL_ROW, MAX_FRAMES, make_env, place_car
+from stad_lab.checkpoints import save_json
 from stad_lab.controller import control, initial_parameters
 from stad_lab.evolution import drive_group, drive_parallel, hand_out, make_strategy
 from stad_lab.frames import OBSERVATION_SHAPE, FrameMemory, to_frame
-from stad_lab.mdn_rnn import MDNRNN, mdn_loss
+from stad_lab.mdn_rnn import MDNRNN, mdn_loss, save_mdn_rnn
 from stad_lab.parallel import keep_freed_memory, worker_processes
 from stad_lab.pipeline import provenance
 from stad_lab.rollouts import RandomDriver, Rollouts, collect_rollouts, track_seeds
@@ -52,12 +52,13 @@ GYMNASIUM, FAST, PHYSICS = "Gymnasium", "stad_lab", "physics alone, no picture"
 CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))
 
 
-def benchmark(parts: list[str], rounds: int = 5) -> dict:
+def benchmark(parts: list[str], rounds: int = 5, file: Path | None = None) -> dict:
     """Run some parts of the benchmark and print their tables.
 
     Args:
         parts: of "parity", "renderer", "loop", "training", "cluster".
         rounds: how often the contenders take turns; parity has no contenders and is measured once.
+        file: where to write the result, after every part; None for nowhere.
 
     Returns:
         A dict for JSON: what it was made with, and for each part its tables with every single measurement.
@@ -77,6 +78,8 @@ def benchmark(parts: list[str], rounds: int = 5) -> dict:
         print(f"\n{part}")
         for name, table in result[part].items():
             print(describe(name, table))
+        if file:
+            save_json(file, result)
     return result
 
 
@@ -262,8 +265,14 @@ def make_world_models_sizes(folder: Path) -> None:
     torch.manual_seed(0)
     settings = Settings.preset("paper")
     autoencoder = AutoEncoder(VARIANT, settings.latent_size, settings.width)
+    save_pair(folder, autoencoder, read_world_model(PRETRAINED / VARIANT, VARIANT).mdn_rnn, settings)
+
+
+def save_pair(folder: Path, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, settings: Settings) -> None:
+    """Write a V and an M that were not trained together as if they were, so that agents can drive with both."""
     save_autoencoder(folder / "autoencoder.safetensors", autoencoder, settings, [])
-    shutil.copyfile(PRETRAINED / VARIANT / "mdn_rnn.safetensors", folder / "mdn_rnn.safetensors")
+    identity = load_autoencoder(folder / "autoencoder.safetensors")[1]["identity"]
+    save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, autoencoder.variant, [], identity)
 
 
 def parallel_speed(executor: Executor, folder: Any, agents: np.ndarray, tracks: list[int], settings: Settings) -> float:
@@ -393,7 +402,8 @@ def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STE
     """Train V for a few steps: (images a second, held-out loss after them).
 
     Plain is what a tutorial would write: a Dataset of single pictures, a DataLoader, PyTorch's layers, memory order and
-    Adam as they come. Ours does as `train_autoencoder` and `training.fit` do. Weights, batches and noise are the same.
+    Adam as they come. Ours does as `train_autoencoder` and `training.fit` do, but for the falling rate, the clipping
+    and the history, which neither has. Weights, batches and noise are the same.
     """
     settings = Settings.preset("laptop", width=width)
     rollouts = Rollouts(folder)

@@ -39,6 +39,12 @@ def check_parameters(parameters: np.ndarray, count: int, source: str | Path = "c
         raise ValueError(f"{source}: parameters that are not finite (NaN or infinite): evolve the controller again")
 
 
+def unpack(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (..., 3, features) and biases (..., 3) of C's parameters (..., parameters)."""
+    weights, bias = parameters[..., :-ACTION_SIZE], parameters[..., -ACTION_SIZE:]
+    return weights.reshape(*bias.shape, -1), bias
+
+
 def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
     """The action of each car.
 
@@ -52,8 +58,7 @@ def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: an action that is not finite. CarRacing would not refuse it: a NaN once earned an instant 999 there.
     """
-    weights = parameters[..., :-ACTION_SIZE].reshape(-1, ACTION_SIZE, features.shape[1])
-    bias = parameters[..., -ACTION_SIZE:].reshape(-1, ACTION_SIZE)
+    weights, bias = unpack(np.atleast_2d(parameters))
     with np.errstate(invalid="ignore"):  # 0 x infinity is reported below
         raw = (weights * features[:, None]).sum(-1) + bias
     if not np.isfinite(raw).all():

@@ -102,9 +102,15 @@ class DreamEnv(gym.Env):
 
     @torch.no_grad()
     def render(self) -> np.ndarray | None:
-        """What V makes of the present z: uint8 (64, 64, 3); None without a render mode."""
+        """What V makes of the present z: uint8 (64, 64, 3); None without a render mode.
+
+        Raises:
+            RuntimeError: called before `reset`.
+        """
         if self.render_mode is None:
             return None
+        if self.latents is None:
+            raise RuntimeError("render before reset: call reset() to begin a dream")
         return to_uint8(self.autoencoder.decode(self.latents[None])[0])[0]
 
     def _info(self) -> dict:

@@ -24,7 +24,7 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
     Raises:
         ValueError: the episode ends before `first`, or a number that is out of range.
     """
-    drive = record_longer_drive(agent, track, first, frames)
+    drive = record_longer_drive(agent, track, first, frames, every)
     film = drive.frames(agent.crop_bar)
     earlier = earlier_frames(film, agent.stride)
     shown = slice(first, None, every)
@@ -47,7 +47,7 @@ def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 
         ValueError: as `film_agent`, or another kind.
     """
     check_kind(kind)
-    drive = record_longer_drive(agent, track, first, frames)
+    drive = record_longer_drive(agent, track, first, frames, every)
     inside = look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
     return film_inside(drive, inside, first, every, kind)
 
@@ -58,9 +58,9 @@ def film_inside(drive: Drive, inside: Inside, first: int = 0, every: int = 3, ki
     return moving_figure((plot_moment(drive, inside, moment) for moment in moments), FRAMES_A_SECOND / every, kind)
 
 
-def record_longer_drive(agent: Agent, track: int, first: int, frames: int) -> Drive:
-    """Record a drive of at most `first + frames` frames. Raises ValueError if it ends before frame `first`."""
-    for name, value, least in (("track", track, 0), ("first", first, 0), ("frames", frames, 1)):
+def record_longer_drive(agent: Agent, track: int, first: int, frames: int, every: int) -> Drive:
+    """Record a drive of at most `first + frames` frames; raises as `film_agent`, before the drive where it can."""
+    for name, value, least in (("track", track, 0), ("first", first, 0), ("frames", frames, 1), ("every", every, 1)):
         if value < least:
             raise ValueError(f"{name}={value}: expected at least {least}")
     drive = record_drive(agent, track, first + frames)

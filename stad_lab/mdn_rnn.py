@@ -16,7 +16,7 @@ from tqdm.auto import tqdm
 from stad_lab.autoencoder import REMEDY, AutoEncoder, check_facts, check_part, load_autoencoder, to_pictures
 from stad_lab.checkpoints import checksum_of_tensors, load_into, load_tensors, locked, save_tensors
 from stad_lab.frames import earlier_frames
-from stad_lab.rollouts import Rollouts
+from stad_lab.rollouts import Rollouts, check_seen
 from stad_lab.settings import Settings
 from stad_lab.training import fit, training_device
 
@@ -102,12 +102,12 @@ def sample_mixture(mixture: Mixture, temperature: float, generator: torch.Genera
     """Draw z (batch, time, latent_size) from the mixture.
 
     Args:
-        temperature: above 0. The weights become softmax(logpi / temperature), the deviations sigma * sqrt(temperature),
-            as in World Models: below 1 M dreams of what is likely, above 1 of what is not.
+        temperature: above 0, from 1e-6 on. The weights become softmax(logpi / temperature), the deviations
+            sigma * sqrt(temperature), as in World Models: below 1 M dreams of what is likely, above 1 of what is not.
         generator: the random source; None for torch's own.
 
     Raises:
-        ValueError: a temperature that is not a finite number above 0.
+        ValueError: a temperature that is not a finite number from 1e-6 on.
     """
     check_temperature(temperature)
     weights = (mixture.logpi / temperature).softmax(-1)
@@ -119,9 +119,11 @@ def sample_mixture(mixture: Mixture, temperature: float, generator: torch.Genera
 
 
 def check_temperature(temperature: float) -> None:
-    """Raise ValueError unless the temperature is a finite number above 0."""
-    if not 0 < temperature < math.inf:
-        raise ValueError(f"temperature={temperature}: expected a finite number above 0; 1 is what M has learned")
+    """Raise ValueError unless the temperature is a finite number above 0, by as much as float32 can divide by."""
+    if not 1e-6 <= temperature < math.inf:
+        raise ValueError(
+            f"temperature={temperature}: expected a finite number above 0, from 1e-6 on; 1 is what M has learned"
+        )
 
 
 @torch.no_grad()
@@ -153,10 +155,7 @@ def sequence_batch(
     Raises:
         ValueError: no episode is longer than `length`.
     """
-    long_enough = [index for index, episode in enumerate(encoded) if episode.shape[1] > length]
-    if not long_enough:
-        longest = max(episode.shape[1] for episode in encoded)
-        raise ValueError(f"m_sequence={length}, but the longest episode has {longest} frames: use shorter sequences")
+    long_enough = long_episodes(encoded, length)
     latents, chosen_actions = [], []
     for index in rng.choice(long_enough, batch):
         mu, logvar = encoded[index]
@@ -166,6 +165,21 @@ def sequence_batch(
         latents.append(mu[stretch] + np.exp(0.5 * logvar[stretch]) * noise)
         chosen_actions.append(actions[index][start : start + length])
     return torch.from_numpy(np.stack(latents)), torch.from_numpy(np.stack(chosen_actions))
+
+
+def long_episodes(encoded: list[np.ndarray], length: int, which: str = "") -> list[int]:
+    """Indices of the episodes with more than `length` frames; raises ValueError if there are none.
+
+    Args:
+        which: what the message calls the episodes, for example "held-out ".
+    """
+    found = [index for index, episode in enumerate(encoded) if episode.shape[1] > length]
+    if not found:
+        longest = max(episode.shape[1] for episode in encoded)
+        raise ValueError(
+            f"m_sequence={length}, but the longest {which}episode has {longest} frames: use shorter sequences"
+        )
+    return found
 
 
 def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folder: Path) -> bool:
@@ -186,6 +200,8 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
         facts = load_mdn_rnn(path, variant)[1]
         check_facts(path, facts, settings)
         check_partner(path, facts, autoencoder=v_facts["identity"])
+        check_seen(path, v_facts["rollouts"], rollouts_folder)
+        checkpoint_of(path).unlink(missing_ok=True)  # of a process that was killed before it did
         return False
     rollouts = Rollouts(rollouts_folder)
     if v_facts["rollouts"] != rollouts.identity:
@@ -230,7 +246,10 @@ def fit_mdn_rnn(
     def heldout_losses() -> dict[str, float]:
         return {"total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))["total"].item()}
 
-    checkpoint = path.with_name("mdn_rnn.training.safetensors")
+    if settings.m_steps:
+        long_episodes(encoded[:first_heldout], settings.m_sequence, "training ")
+        long_episodes(encoded[first_heldout:], settings.m_sequence, "held-out ")
+    checkpoint = checkpoint_of(path)
     identity = {"part": "mdn_rnn", "variant": variant, "autoencoder": autoencoder, "rollouts": rollouts.identity}
     identity |= settings.as_dict()
     steps, rate = settings.m_steps, settings.m_learning_rate
@@ -238,6 +257,11 @@ def fit_mdn_rnn(
         history = fit(mdn_rnn, batch, losses, heldout_losses, steps, rate, checkpoint, "train M", identity)
         save_mdn_rnn(path, mdn_rnn, variant, history, autoencoder)
         checkpoint.unlink(missing_ok=True)  # there is none after 0 steps
+
+
+def checkpoint_of(path: Path) -> Path:
+    """Where the training of M that ends in `path` keeps its state."""
+    return path.with_name("mdn_rnn.training.safetensors")
 
 
 def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list, autoencoder: str | None = None) -> None:

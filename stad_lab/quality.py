@@ -168,7 +168,7 @@ def pit(mixture: Mixture, latents: np.ndarray) -> np.ndarray:
     """
     target = torch.from_numpy(latents[:, 1:, :, None])
     below = torch.special.ndtr((target - mixture.mean) * torch.exp(-mixture.logsigma))
-    return (mixture.logpi.exp() * below).sum(dim=-1).numpy()
+    return (mixture.logpi.exp() * below).sum(dim=-1).clamp(max=1).numpy()  # weights add up to 1 but for rounding
 
 
 @torch.no_grad()

@@ -22,15 +22,15 @@ from pathlib import Path
 import numpy as np
 from tqdm.auto import tqdm
 
-from stad_lab.autoencoder import AutoEncoder, load_autoencoder, save_autoencoder
-from stad_lab.benchmark import train_m, train_v
+from stad_lab.autoencoder import AutoEncoder
+from stad_lab.benchmark import save_pair, train_m, train_v
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum, copy_file, load_json, save_json
 from stad_lab.controller import initial_parameters, squash
 from stad_lab.evaluation import SOLVED, evaluate, report
 from stad_lab.evolution import CONTROLLER, LOG, drive_generation
 from stad_lab.finish import finish
-from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
+from stad_lab.mdn_rnn import MDNRNN
 from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.pipeline import provenance, train
 from stad_lab.rollouts import RandomDriver, collect_rollouts
@@ -229,9 +229,7 @@ def speeds(row: Row, folder: Path) -> dict[str, float]:
     collect_rollouts(Settings.preset("quick"), folder / "rollouts")
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
     autoencoder = AutoEncoder(row.variant, settings.latent_size, settings.width)
-    save_autoencoder(folder / "autoencoder.safetensors", autoencoder, settings, [])
-    v_identity = load_autoencoder(folder / "autoencoder.safetensors")[1]["identity"]
-    save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, row.variant, [], v_identity)
+    save_pair(folder, autoencoder, mdn_rnn, settings)
     brief = dataclasses.replace(settings, max_frames=length)
     start = initial_parameters(settings.latent_size, settings.hidden_size, settings.initial_gas)
     with worker_processes(settings.processes) as executor:

@@ -212,6 +212,22 @@ class EpisodeFrames(Sequence):
                 file.readinto(frame.data)
 
 
+def identity_of(manifest: dict) -> str:
+    """The checksum of a whole dataset."""
+    return checksum(json.dumps(manifest["blocks"]).encode())
+
+
+def check_seen(path: Path, seen: str | None, folder: Path) -> None:
+    """Raise ValueError if the weights in `path` have seen other rollouts than those in `folder`, as far as both tell.
+
+    Args:
+        seen: identity of the rollouts that they were trained on; None if that is not known.
+    """
+    manifest = Path(folder) / "manifest.json"
+    if seen and manifest.exists() and seen != identity_of(load_json(manifest)):
+        raise ValueError(f"{path} was trained on other rollouts than those in {folder}: give its own ones")
+
+
 class Rollouts:
     """The dataset in a folder, read-only.
 
@@ -235,7 +251,7 @@ class Rollouts:
         if found != wanted:
             raise ValueError(f"{self.folder} holds {found} of {wanted} episodes: {remedy}")
         blocks = self.manifest["blocks"]
-        self.identity = checksum(json.dumps(blocks).encode())
+        self.identity = identity_of(self.manifest)
         for entry in blocks:
             self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
         self.frames = EpisodeFrames([block_path(self.folder, entry["index"], "frames") for entry in blocks])

@@ -16,7 +16,7 @@ import torch
 from stad_lab.agent import Agent, WorldModel, load_controller, read_world_model
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum, save_tensors
-from stad_lab.controller import ACTION_SIZE, seen_columns
+from stad_lab.controller import ACTION_SIZE, seen_columns, unpack
 from stad_lab.evolution import CONTROLLER, hand_out, make_agent
 from stad_lab.frames import to_frame
 from stad_lab.parallel import work_alone, worker_processes
@@ -144,7 +144,7 @@ def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder:
 
 def outputs(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """C's three outputs before squashing, (T, 3), for what it sees, (T, features)."""
-    weights, bias = parameters[:-ACTION_SIZE].reshape(ACTION_SIZE, -1), parameters[-ACTION_SIZE:]
+    weights, bias = unpack(parameters)
     return seen @ weights.T + bias
 
 

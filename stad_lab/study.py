@@ -5,8 +5,9 @@
     autoencoder  the quality of V in every variant, and rate against distortion over the weight of the KL
     mdn_rnn      the quality of M: its NLL beside simple forecasts and lesser M's, its calibration, its dreams' error
 
-The V and M that come with stad_lab are measured. What else the comparison needs is trained in a working folder, on the
-rollouts that those were trained on, and an interrupted study goes on where it stopped.
+The V and M that come with stad_lab are measured. What else the comparison needs is trained in a working folder, on
+rollouts by the settings that those had, and an interrupted study goes on where it stopped. (The shipped ones saw the
+pictures of an earlier version of the fast renderer: what is trained here has the advantage of the present one.)
 """
 
 import dataclasses
@@ -85,7 +86,7 @@ def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str
     """
     check_parts(parts)
     collect_rollouts(settings, rollouts_folder)
-    drives = random_drives(max(12, settings.episodes // 5), settings.processes)
+    drives = random_drives(max(12, settings.episodes // 5), settings.seed + 1, settings.processes)
     file, result = Path(work) / "study.json", {}
     for name in parts:
         found = PARTS[name](settings, Path(rollouts_folder), Path(work), drives)
@@ -102,9 +103,12 @@ def check_parts(parts: list[str]) -> None:
             raise ValueError(f"unknown part {part!r}: choose from {', '.join(PARTS)}")
 
 
-def random_drives(count: int, processes: int) -> list[Drive]:
-    """Drives of the random driver, each from a random tile of a track kept for inspection."""
-    settings = Settings.preset("laptop", seed=1, episodes=count, episode_frames=DRIVE_FRAMES, random_starts=1.0)
+def random_drives(count: int, seed: int, processes: int) -> list[Drive]:
+    """Drives of the random driver, each from a random tile of a track kept for inspection.
+
+    With the seed of some rollouts its hand would do there what it did in those.
+    """
+    settings = Settings.preset("laptop", seed=seed, episodes=count, episode_frames=DRIVE_FRAMES, random_starts=1.0)
     return record_all(functools.partial(record_random_drive, settings), list(range(count)), "random", processes)
 
 
@@ -290,7 +294,7 @@ def simple_forecasts(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray
 def lesser_forecasts(
     settings: Settings, rollouts_folder: Path, work: Path, world_model: WorldModel, z: np.ndarray, actions: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """NLL of M's that lack something, trained like the whole one on the same data."""
+    """NLL of M's that lack something, trained like the whole one."""
     rollouts, encoded, result = Rollouts(rollouts_folder), None, {}
     identity = world_model.identities["autoencoder"]
     for name, (changes, sees_actions) in CONTENDERS.items():
@@ -299,7 +303,7 @@ def lesser_forecasts(
         lesser = dataclasses.replace(lesser, m_batch=settings.m_batch * settings.m_sequence // lesser.m_sequence)
         record = open_record(path.parent, "input", lesser, STUDY_COMMAND.format(settings.name, "mdn_rnn"))
         if not path.exists():
-            encoded = encoded or encode_rollouts(world_model.autoencoder, rollouts, settings.stride)
+            encoded = encoded or encode_rollouts(world_model.autoencoder, rollouts, world_model.stride)
             torch.manual_seed(settings.seed)
             mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures)
             shown = [action * sees_actions for action in rollouts.actions]

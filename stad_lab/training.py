@@ -2,7 +2,7 @@
 
 What happens in step s depends on (seed, s) and the weights alone: the caller draws step s's batch and noise from a
 Generator seeded with both. So a run that was interrupted and resumed makes the same updates as one that was not: bit
-for bit on the CPU, and nearly so on a GPU, whose convolutions add up in any order.
+for bit on the CPU, with as many threads, and nearly so on a GPU, whose convolutions add up in any order.
 """
 
 import math
@@ -46,7 +46,8 @@ def fit(
         batch: step -> that step's batch, as `read_ahead` wants it.
         losses: the batch -> its named losses; "total" is minimised.
         heldout_losses: named losses on held-out data, computed without gradients.
-        learning_rate: Adam's rate at the start; it falls to a tenth of it along a cosine.
+        learning_rate: Adam's rate at the start; it falls to a tenth of it along a cosine. Gradients of a norm above 100
+            are shortened to that.
         checkpoint: file of the training state, read if it exists, written with every entry of the history.
         label: what the progress bar says.
         identity: settings and checksums of all that the training depends on; a checkpoint of another one is refused.

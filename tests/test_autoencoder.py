@@ -1,5 +1,7 @@
 """V: four variants, the loss term by term, and a training that an interrupt does not change."""
 
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -15,8 +17,9 @@ from stad_lab.autoencoder import (
     to_pictures,
     train_autoencoder,
 )
-from stad_lab.checkpoints import load_tensors
+from stad_lab.checkpoints import load_json, load_tensors, save_json
 from stad_lab.frames import difference_image
+from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.settings import Settings
 
 
@@ -217,6 +220,23 @@ def test_a_loss_that_is_not_finite_stops_the_training(quick_run, tmp_path):
     settings = Settings.preset("quick", width=4, difference_weight=1e12, kl_weight=1e12, v_learning_rate=1e6)
     with pytest.raises(FloatingPointError, match=r"train V .output.: the loss is .* in step .*lower the learning rate"):
         train_autoencoder("output", settings, quick_run / "rollouts", tmp_path)
+
+
+def test_v_and_m_of_other_rollouts_are_refused(quick_run, tmp_path):
+    manifest = load_json(quick_run / "rollouts" / "manifest.json")
+    save_json(tmp_path / "manifest.json", manifest | {"blocks": manifest["blocks"][::-1]})
+    for train in (train_autoencoder, train_mdn_rnn):
+        with pytest.raises(ValueError, match=r".safetensors was trained on other rollouts than those in"):
+            train("input_output", Settings.preset("quick"), tmp_path, quick_run)
+
+
+def test_a_training_state_that_a_killed_process_left_behind_is_cleared_away(quick_run, tmp_path):
+    for part, train in (("autoencoder", train_autoencoder), ("mdn_rnn", train_mdn_rnn)):
+        shutil.copy(quick_run / f"{part}.safetensors", tmp_path)
+        left_over = tmp_path / f"{part}.training.safetensors"
+        left_over.write_bytes(b"state")
+        assert not train("input_output", Settings.preset("quick"), quick_run / "rollouts", tmp_path)
+        assert not left_over.exists()
 
 
 def test_saved_weights_are_loaded_to_the_same_pictures(tmp_path):

@@ -1,11 +1,28 @@
 """The benchmark: fair turns, parts that add up, contenders that compute the same; the speeds are its own business."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from stad_lab.__main__ import main
-from stad_lab.benchmark import FAST, GYMNASIUM, PHYSICS, benchmark, describe, frame_budget, take_turns, train_m, train_v
+from stad_lab.agent import load_agent, read_world_model
+from stad_lab.benchmark import (
+    FAST,
+    GYMNASIUM,
+    PARTS,
+    PHYSICS,
+    VARIANT,
+    benchmark,
+    describe,
+    frame_budget,
+    make_world_models_sizes,
+    parallel_speed,
+    take_turns,
+    train_m,
+    train_v,
+)
+from stad_lab.checkpoints import load_json
 from stad_lab.rollouts import collect_rollouts
 from stad_lab.settings import Settings
 
@@ -33,6 +50,31 @@ def test_the_parts_of_a_frame_add_up_to_the_whole():
     assert sum(budget.values()) == pytest.approx(whole)
     assert {"physics", "picture", "preparation", "V", "M", "C"} < budget.keys()
     assert all(0 < budget[name] < whole for name in ("physics", "preparation", "V", "M", "C"))
+
+
+def test_agents_drive_with_world_models_sizes(tmp_path):
+    make_world_models_sizes(tmp_path)
+    brief = Settings.preset("paper", max_frames=10)
+    agent = load_agent(VARIANT)
+    assert read_world_model(tmp_path, VARIANT).autoencoder.width == brief.width > agent.autoencoder.width
+    with ThreadPoolExecutor(1) as executor:
+        assert parallel_speed(executor, tmp_path, agent.parameters[None], [7], brief) > 0
+
+
+@pytest.mark.long
+def test_the_whole_benchmark_runs_to_its_end(tmp_path):
+    assert main(["benchmark", "--rounds", "1", "--json", str(tmp_path / "benchmark.json")]) == 0
+    assert load_json(tmp_path / "benchmark.json").keys() == {"made_with", "rounds", *PARTS}
+
+
+def test_what_is_measured_is_kept_though_a_later_part_fails(tmp_path, monkeypatch):
+    def fail(rounds):
+        raise ValueError("broken")
+
+    monkeypatch.setattr("stad_lab.benchmark.PARTS", {"parity": lambda rounds: {}, "loop": fail})
+    with pytest.raises(ValueError, match="broken"):
+        benchmark(["parity", "loop"], 1, tmp_path / "benchmark.json")
+    assert "parity" in load_json(tmp_path / "benchmark.json")
 
 
 def test_the_plain_way_and_ours_train_the_same_v(tmp_path):

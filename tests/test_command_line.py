@@ -15,6 +15,7 @@ from stad_lab.__main__ import main, read_changes
 from stad_lab.agent import save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, save_autoencoder
 from stad_lab.checkpoints import load_json, save_json
+from stad_lab.film import film_agent
 from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
 from stad_lab.pipeline import command_of
 from stad_lab.settings import PRESETS, Settings
@@ -172,6 +173,11 @@ def test_a_film_is_a_moving_picture(name, options, quick_run, tmp_path, capsys):
         pictures = [np.array(frame.convert("RGB")) for frame in ImageSequence.Iterator(film)]
     assert len(pictures) == 4  # every third frame
     assert not np.array_equal(pictures[0], pictures[-1])
+
+
+def test_a_film_of_no_frame_is_refused_before_the_drive(agent):
+    with pytest.raises(ValueError, match="every=0: expected at least 1"):
+        film_agent(agent, track=0, first=0, frames=10, every=0)
 
 
 def test_an_unknown_variant_ends_in_one_clear_line(tmp_path, command_line):

@@ -93,7 +93,7 @@ def test_latents_that_do_not_fit_are_refused(dream):
         dream.reset(options={"latents": np.full(32, np.nan)})
 
 
-@pytest.mark.parametrize("temperature", [0, -1, float("nan")])
+@pytest.mark.parametrize("temperature", [0, -1, 1e-40, float("nan")])
 def test_a_temperature_that_is_no_positive_number_is_refused(temperature, agent):
     with pytest.raises(ValueError, match=f"temperature={temperature}: expected a .*number above 0"):
         DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature)
@@ -107,6 +107,11 @@ def test_another_render_mode_is_refused(agent):
 def test_a_step_before_reset_is_refused(dream):
     with pytest.raises(RuntimeError, match="step before reset: call reset"):
         dream.step(ACTION)
+
+
+def test_a_picture_before_reset_is_refused(agent):
+    with pytest.raises(RuntimeError, match="render before reset: call reset"):
+        DreamEnv(agent.autoencoder, agent.mdn_rnn, render_mode="rgb_array").render()
 
 
 def test_an_agent_dreams_on_without_being_changed(agent, observations):

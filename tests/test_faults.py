@@ -180,12 +180,15 @@ def assert_refused(read, folder, name, what):
     assert all(after[path] == before[path] for path in after), (name, what)
 
 
+def copy_for(name, run, folder):
+    """A copy of a run, without the checkpoints unless one of them is to be broken: beside weights they are deleted."""
+    shutil.copytree(run, folder, ignore=shutil.ignore_patterns(*() if name in CHECKPOINTS else CHECKPOINTS))
+    return folder
+
+
 @pytest.mark.parametrize("name", READERS)
 def test_a_damaged_file_is_refused_before_use_and_stays_as_it_is(name, whole, tmp_path):
-    folder, refused = shutil.copytree(whole, tmp_path / "run"), 0
-    if not name.startswith(CHECKPOINTS):
-        for checkpoint in CHECKPOINTS:
-            (folder / checkpoint).unlink()
+    folder, refused = copy_for(name, whole, tmp_path / "run"), 0
     content, rng = (folder / name).read_bytes(), random.Random(name)
     for what, damaged in damages(content, rng):
         for read in READERS[name]:
@@ -202,7 +205,7 @@ def test_a_damaged_file_is_refused_before_use_and_stays_as_it_is(name, whole, tm
 
 @pytest.mark.parametrize("name", READERS)
 def test_a_file_of_another_run_is_refused_before_use(name, whole, another, tmp_path, in_this_process):
-    folder = shutil.copytree(whole, tmp_path / "run")
+    folder = copy_for(name, whole, tmp_path / "run")
     shutil.copy(another / name, folder / name)
     if name == "evaluation.json":
         assert verify(folder, in_this_process)["evaluations"].startswith(f"FAILED: {folder / name} tells of another")

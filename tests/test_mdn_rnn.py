@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from stad_lab.checkpoints import load_tensors
 from stad_lab.mdn_rnn import (
     MDNRNN,
     Mixture,
+    fit_mdn_rnn,
     load_mdn_rnn,
     mdn_loss,
     sample_mixture,
@@ -144,7 +146,9 @@ def test_samples_repeat_with_the_generator_and_leave_torch_s_own_alone():
 
 @pytest.mark.parametrize("temperature", [0, -1.0, float("nan"), float("inf")])
 def test_a_temperature_that_is_no_positive_number_is_refused(temperature):
-    with pytest.raises(ValueError, match=f"temperature={temperature}: expected a .*number above 0; 1 is what M has"):
+    with pytest.raises(
+        ValueError, match=f"temperature={temperature}: expected a .*number above 0, from 1e-6 on; 1 is what M"
+    ):
         sample_mixture(make_mixture(), temperature)
 
 
@@ -175,6 +179,22 @@ def test_sequences_longer_than_every_episode_are_refused():
     encoded = [np.zeros((2, 20, 2), np.float32)]
     with pytest.raises(ValueError, match="m_sequence=20, but the longest episode has 20 frames: use shorter sequences"):
         sequence_batch(encoded, [np.zeros((20, 3), np.float32)], 20, 1, np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(("lengths", "which"), [((30, 10), "held-out"), ((10, 30), "training")])
+def test_a_training_without_a_sequence_for_both_losses_is_refused_before_it_begins(lengths, which, tmp_path):
+    encoded, actions = (
+        [np.zeros((2, n, 4), np.float32) for n in lengths],
+        [np.zeros((n, 3), np.float32) for n in lengths],
+    )
+    episode = np.repeat([0, 1], lengths)
+    rollouts = SimpleNamespace(
+        episode=episode, identity="two", split=lambda: (np.flatnonzero(episode == 0), np.flatnonzero(episode == 1))
+    )
+    settings = Settings.preset("quick", m_sequence=20)
+    with pytest.raises(ValueError, match=f"m_sequence=20, but the longest {which} episode has 10 frames: use shorter"):
+        fit_mdn_rnn(tmp_path / "m", make_mdn_rnn(), "input", "v", encoded, actions, rollouts, settings)
+    assert not list(tmp_path.iterdir())
 
 
 def test_training_lowers_the_held_out_loss(quick_run):

@@ -117,7 +117,9 @@ def test_pit_is_uniform_for_an_honest_forecast_and_tells_too_sure_from_not_sure_
     mixture = Mixture(logits.log_softmax(-1), 0 * mean, 0.1 * logsigma)
     z = spread * sample_mixture(mixture, 1.0, generator)
     z = torch.cat([z[:, :1], z], dim=1).numpy()
-    edges = (np.abs(pit(mixture, z) - 0.5) > 0.4).mean()
+    found = pit(mixture, z)
+    assert found.min() >= 0 and found.max() <= 1
+    edges = (np.abs(found - 0.5) > 0.4).mean()
     bounds = {"uniform": (0.18, 0.22), "edges": (0.3, 1), "middle": (0, 0.1)}[shape]
     assert bounds[0] < edges < bounds[1]
 
