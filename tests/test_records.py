@@ -195,7 +195,11 @@ def test_the_words_on_single_changes_hold_for_the_records():
     assert "Its three searches, on one V and M, have {:.1f}, {:.1f} and {:.1f}".format(*searches) in README
     means = {name: official_returns(rows[name]).mean() for name in ABLATIONS if name in rows}
     among = [name for name, mean in means.items() if searches.min() < mean < searches.max()]
-    assert among == ["no_M", "no_z", "untrained_M", "stride_8"] and means["no_bar"] < searches.min()
+    assert among == ["no_M", "no_z", "untrained_M", "stride_2", "stride_8"] and means["no_bar"] < searches.min()
+    strides = [official_returns(rows[f"stride_{stride}"]) for stride in (1, 2, 8)]
+    assert [round(float(np.median(found))) for found in strides] == [909, 893, 914]
+    assert [round(float(median)) for median in np.median(base, axis=1)] == [918, 929, 927]
+    assert max((found >= 900).mean() for found in strides) < (base >= 900).mean(axis=1).min()
     scatter = [round(float(np.ptp(found.mean(axis=1)))) for found in (two_rounds, base)]
     laps = [round(100 * float((found >= 900).mean())) for found in (two_rounds, base)]
     assert (scatter, laps) == ([21, 59], [93, 75])
