@@ -162,7 +162,8 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert always == {"frame": [], "input": [2, 68], "output": [2, 19], "input_output": []}
     assert np.flatnonzero((returns["finished_input"] < 800).all(axis=0)).tolist() == [2, 19, 68]
     good = {name for name, found in returns.items() if found.mean() > 850}
-    assert {name for name in good if returns[name][:, 19].min() > 800} == {"two_rounds_frame", "finished_frame"}
+    never = {name for name in good if returns[name][:, 19].min() > 800}
+    assert never >= {name for name in good if ROWS[name].variant == "frame"} and len(never) < len(good) / 3
     behind = worlds([folder for name in good for folder in rows[name] if ROWS[name].variant == "input"])
     assert len({autoencoder for autoencoder, _ in behind}) > 3
     assert [(returns[f"{recipe}_input"] < 800).sum() for recipe in ("two_rounds", "finished")] == [16, 15]
