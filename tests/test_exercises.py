@@ -363,6 +363,14 @@ WRONG = [
     ),
     (
         "04",
+        "weights-check",
+        "def weights(size):\n"
+        "    raw = np.log(size // 2 + 0.5) - np.log(np.arange(1, size // 2 + 1))\n"
+        "    return raw / raw.sum()",
+        "for an even size only",
+    ),
+    (
+        "04",
         "new-mean-check",
         "new_mean = lambda population, cost: weights(10) @ population[np.argsort(cost)[::-1][:5]]",
         "mean of the worst",
