@@ -201,6 +201,9 @@ def test_the_words_on_single_changes_hold_for_the_records():
     assert [round(float(np.median(found))) for found in strides] == [909, 893, 914]
     assert [round(float(median)) for median in np.median(base, axis=1)] == [918, 929, 927]
     assert max((found >= 900).mean() for found in strides) < (base >= 900).mean(axis=1).min()
+    wide = official_returns(rows["latent_64"])
+    assert round(float(wide.mean())) == 848 < searches.min() and (wide < 800).sum() == 15
+    assert np.median(base, axis=1).min() < np.median(wide) < np.median(base, axis=1).max()
     scatter = [round(float(np.ptp(found.mean(axis=1)))) for found in (two_rounds, base)]
     laps = [round(100 * float((found >= 900).mean())) for found in (two_rounds, base)]
     assert (scatter, laps) == ([21, 59], [93, 75])
