@@ -201,6 +201,10 @@ def test_the_words_on_single_changes_hold_for_the_records():
     assert [round(float(np.median(found))) for found in strides] == [909, 893, 914]
     assert [round(float(median)) for median in np.median(base, axis=1)] == [918, 929, 927]
     assert max((found >= 900).mean() for found in strides) < (base >= 900).mean(axis=1).min()
+    narrow = official_returns(rows["latent_16"])
+    assert round(float(narrow.mean())) == 760 and (narrow < 800).sum() == 40
+    assert base.mean() - narrow.mean() > 2 * np.ptp(searches)
+    assert round(float(np.median(base, axis=1).min() - np.median(narrow))) == 45
     wide = official_returns(rows["latent_64"])
     assert round(float(wide.mean())) == 848 < searches.min() and (wide < 800).sum() == 15
     assert np.median(base, axis=1).min() < np.median(wide) < np.median(base, axis=1).max()
