@@ -82,7 +82,7 @@ def finish(
 
 def check_earlier(variant: str, settings: Settings, earlier: Path) -> dict:
     """The record of the earlier run, if a finish with these settings can go on from it. Raises as `finish`."""
-    record = load_json(earlier / "record.json", EARLIER)
+    record = read_finished(earlier)
     was = {"variant": record["variant"], **Settings.from_dict(record["settings"]).as_dict()}
     for name, value in {"variant": variant, **settings.as_dict()}.items():
         if name not in OPEN and was[name] != value:
@@ -93,7 +93,7 @@ def check_earlier(variant: str, settings: Settings, earlier: Path) -> dict:
     load_agent(variant, earlier)
     if settings.components:
         load_directions(earlier / COMPONENTS, read_world_model(earlier, variant))
-    return read_finished(earlier)
+    return record
 
 
 def begin_finish(variant: str, earlier: Path, folder: Path) -> bool:
