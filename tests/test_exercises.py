@@ -118,6 +118,8 @@ def test_points_in_the_table_are_those_that_nbgrader_gives(name):
         if grading(cell)["grade"]:
             points[exercise] += grading(cell)["points"]
     assert points == table and len(table) >= 4
+    rubric = re.search(r"\| rubric \| points \|\n.*\n((\|.*\n?)+)", "\n\n".join(cell["source"] for cell in cells))
+    assert sum(int(row) for row in re.findall(r"\| (\d+) \|$", rubric[1], re.MULTILINE)) == table[max(table)]
 
 
 @pytest.fixture(scope="module")
@@ -231,6 +233,13 @@ WRONG = [
     ("02", "kl-values", "kl = lambda mu, logvar: 0.5 * (mu**2 + logvar.exp() - 1 - logvar)", "each latent by itself"),
     ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v.exp() * noise", "the variance"),
     ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v * noise", "is a logarithm"),
+    ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + (v / 2).exp()", "no noise in it"),
+    (
+        "02",
+        "reparameterise-values",
+        "reparameterise = lambda mu, v, noise: mu + (v / 2).exp() * torch.randn_like(mu)",
+        "drawn by you",
+    ),
     (
         "02",
         "reparameterise-values",
@@ -359,6 +368,12 @@ WRONG = [
         "04",
         "weights-check",
         "weights = lambda n: np.log(n // 2 + 0.5) - np.log(np.arange(n // 2))",
+        "ranks count from 1",
+    ),
+    (
+        "04",
+        "weights-check",
+        "def weights(n):\n    raw = np.log(n // 2 + 0.5) - np.log(np.arange(n // 2))\n    return raw / raw.sum()",
         "ranks count from 1",
     ),
     (
