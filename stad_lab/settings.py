@@ -51,7 +51,7 @@ class Settings:
     kl_weight: float = 0.25
     """Weight of the KL term against the squared errors. World Models has 1."""
     free_bits: float = 0.0
-    """KL below this many nats for each latent dimension costs nothing. World Models has 0.5."""
+    """A picture's whole KL costs nothing below so many nats times `latent_size`. World Models has 0.5."""
     difference_weight: float = 1.0
     """Weight of the difference image's squared error, in the variants that redraw it."""
     v_steps: int = 5000
@@ -167,6 +167,7 @@ NO_LESS_THAN_ZERO = (
     "components",
 )
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
+AT_MOST = {"episode_frames": 1000, "max_frames": 1000}  # CarRacing ends an episode then
 SHARES = ("random_starts", "revisited_share", "averaged_share", "sigma_decay")
 FEATURES = ("z, h", "z", "h")
 
@@ -179,9 +180,11 @@ def check_value(name: str, kind: type, value) -> None:
         raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
     if kind in (int, float):
         lowest = AT_LEAST.get(name, 0 if name in (*NO_LESS_THAN_ZERO, *SHARES) else 1 if kind is int else 1e-12)
-        highest = 1.0 if name in SHARES else 1e12
+        highest = AT_MOST.get(name, 1.0 if name in SHARES else 1e12)
         if not lowest <= value <= highest:
             raise ValueError(f"{name}={value!r} is out of range: expected {lowest:g} to {highest:g}")
+    if name == "name" and value not in ("quick", "laptop", "paper"):
+        raise ValueError(f"name={value!r}: expected the preset that the settings began as, quick, laptop or paper")
     if name == "features" and value not in FEATURES:
         raise ValueError(f"features={value!r}: choose one of {', '.join(map(repr, FEATURES))}")
 

@@ -83,6 +83,9 @@ def test_an_unknown_field_is_refused_with_the_choices(make):
         ("processes", 0, "expected 1 to"),
         ("episodes", 1, "expected 2 to"),  # one to train on, one held out
         ("seed", None, "expected int"),
+        ("episode_frames", 1500, "expected 1 to 1000"),  # CarRacing ends an episode then
+        ("max_frames", 1001, "expected 1 to 1000"),
+        ("name", "mine", "expected the preset"),
     ],
 )
 def test_a_wrong_value_is_refused_with_its_name_and_what_was_expected(field, value, expected):
