@@ -25,6 +25,17 @@ from stad_lab.training import fit, training_device
 
 VARIANTS = ("frame", "input", "output", "input_output")
 REMEDY = "train it: python -m stad_lab train --help"
+V_SETTINGS = (  # what a trained V depends on, beside its sizes and its rollouts
+    "seed",
+    "stride",
+    "crop_bar",
+    "kl_weight",
+    "free_bits",
+    "difference_weight",
+    "v_steps",
+    "v_batch",
+    "v_learning_rate",
+)
 
 
 def check_variant(variant: str) -> None:
@@ -277,7 +288,8 @@ def save_autoencoder(
     rollouts says what it has seen.
     """
     facts = {"part": "autoencoder", "variant": autoencoder.variant, "width": autoencoder.width}
-    facts |= {"latent_size": autoencoder.latent_size, "stride": settings.stride, "crop_bar": settings.crop_bar}
+    facts["latent_size"] = autoencoder.latent_size
+    facts |= {name: getattr(settings, name) for name in V_SETTINGS}
     facts |= {"identity": checksum_of_tensors(autoencoder.state_dict()), "rollouts": rollouts}
     save_tensors(path, autoencoder.state_dict(), **facts, history=history)
 

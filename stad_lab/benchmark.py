@@ -272,7 +272,7 @@ def save_pair(folder: Path, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, settings:
     """Write a V and an M that were not trained together as if they were, so that agents can drive with both."""
     save_autoencoder(folder / "autoencoder.safetensors", autoencoder, settings, [])
     identity = load_autoencoder(folder / "autoencoder.safetensors")[1]["identity"]
-    save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, autoencoder.variant, [], identity)
+    save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, autoencoder.variant, settings, [], identity)
 
 
 def parallel_speed(executor: Executor, folder: Any, agents: np.ndarray, tracks: list[int], settings: Settings) -> float:

@@ -21,6 +21,7 @@ from stad_lab.settings import Settings
 from stad_lab.training import fit, training_device
 
 ACTION_SIZE = 3
+M_SETTINGS = ("seed", "m_steps", "m_batch", "m_sequence", "m_learning_rate")  # what a trained M depends on, beside V
 LOGSIGMA_RANGE = (-5.0, 3.0)  # a narrower Gaussian would let the likelihood run away on a single latent
 
 State = tuple[torch.Tensor, torch.Tensor]  # h and c of the LSTM, each (1, batch, hidden_size)
@@ -255,7 +256,7 @@ def fit_mdn_rnn(
     steps, rate = settings.m_steps, settings.m_learning_rate
     with locked(path.parent):
         history = fit(mdn_rnn, batch, losses, heldout_losses, steps, rate, checkpoint, "train M", identity)
-        save_mdn_rnn(path, mdn_rnn, variant, history, autoencoder)
+        save_mdn_rnn(path, mdn_rnn, variant, settings, history, autoencoder)
         checkpoint.unlink(missing_ok=True)  # there is none after 0 steps
 
 
@@ -264,10 +265,13 @@ def checkpoint_of(path: Path) -> Path:
     return path.with_name("mdn_rnn.training.safetensors")
 
 
-def save_mdn_rnn(path: Path, mdn_rnn: MDNRNN, variant: str, history: list, autoencoder: str | None = None) -> None:
+def save_mdn_rnn(
+    path: Path, mdn_rnn: MDNRNN, variant: str, settings: Settings, history: list, autoencoder: str | None = None
+) -> None:
     """Write M's weights with what is needed to build it again, and the variant and identity of the V it belongs to."""
-    sizes = {name: getattr(mdn_rnn, name) for name in ("latent_size", "hidden_size", "mixtures")}
-    facts = {"part": "mdn_rnn", "variant": variant, **sizes, "autoencoder": autoencoder, "history": history}
+    facts = {"part": "mdn_rnn", "variant": variant, "autoencoder": autoencoder, "history": history}
+    facts |= {name: getattr(mdn_rnn, name) for name in ("latent_size", "hidden_size", "mixtures")}
+    facts |= {name: getattr(settings, name) for name in M_SETTINGS}
     save_tensors(path, mdn_rnn.state_dict(), identity=checksum_of_tensors(mdn_rnn.state_dict()), **facts)
 
 

@@ -291,7 +291,7 @@ def test_training_on_top_of_weights_of_another_size_ends_in_one_clear_line(part,
         save_autoencoder(run / f"{part}.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
         (run / "mdn_rnn.safetensors").unlink()
     else:
-        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 32, 5), "input_output", [])
+        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 32, 5), "input_output", PRESETS["quick"], [])
     (run / "controller.safetensors").unlink()
     (run / "evolution.json").unlink()
     error = the_error(capsys, train_quickly(run))
