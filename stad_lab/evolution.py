@@ -30,7 +30,7 @@ from stad_lab.agent import (
 )
 from stad_lab.checkpoints import load_json, locked, save_json
 from stad_lab.mdn_rnn import check_partner
-from stad_lab.parallel import return_freed_memory, run_tasks, work_alone, worker_processes
+from stad_lab.parallel import refuse_in_starting_worker, return_freed_memory, run_tasks, work_alone, worker_processes
 from stad_lab.rollouts import track_seeds
 from stad_lab.search_space import SearchSpace, search_space
 from stad_lab.settings import Settings, check_same_run
@@ -69,6 +69,7 @@ def evolve(
         TaskError: a drive failed, or no worker answers.
         KeyboardInterrupt: passed on; the log holds every finished generation.
     """
+    refuse_in_starting_worker()
     folder = Path(folder)
     world_model = read_world_model(folder, variant)
     log = read_log(variant, settings, folder, world_model)

@@ -43,9 +43,11 @@ class WorkerProcesses(Executor):
 
     Raises:
         ValueError: fewer than 1 process.
+        RuntimeError: this is itself a worker that is just starting.
     """
 
     def __init__(self, count: int, time_limit: float = TIME_LIMIT):
+        refuse_in_starting_worker()
         if count < 1:
             raise ValueError(
                 f"processes={count}: expected at least 1; as many as the machine has cores is a good choice"
@@ -61,7 +63,6 @@ class WorkerProcesses(Executor):
     def submit(self, function: Callable, /, *arguments, **named) -> Future:
         """As for every Executor: the promise of what `function` returns."""
         task = Future()
-        task.set_running_or_notify_cancel()
         with self.lock:
             self.unfinished += 1
         self._begin(task, functools.partial(function, *arguments, **named))
@@ -101,17 +102,21 @@ class WorkerProcesses(Executor):
         except BrokenProcessPool as error:  # it broke a moment ago
             attempt = Future()
             attempt.set_exception(error)
+        task.add_done_callback(lambda task: task.cancelled() and attempt.cancel())
         attempt.add_done_callback(functools.partial(self._end, task, work, pool))
 
     def _end(self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future) -> None:
         error = BrokenProcessPool("the workers were stopped") if attempt.cancelled() else attempt.exception()
-        if isinstance(error, BrokenProcessPool) and not self.closed.is_set() and self._replace(pool):
+        lost = isinstance(error, BrokenProcessPool) and not task.cancelled()
+        if lost and not self.closed.is_set() and self._replace(pool):
             self._begin(task, work)
             return
         with self.lock:
             self.unfinished -= 1
             self.last_sign = time.monotonic()
             self.losses = 0 if error is None else self.losses
+        if not task.set_running_or_notify_cancel():
+            return
         if error is None:
             task.set_result(attempt.result())
         else:
@@ -192,6 +197,15 @@ def run_tasks(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def refuse_in_starting_worker() -> None:
+    """Raise RuntimeError in a worker that runs its parent's script again before it can do anything."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        raise RuntimeError(
+            "a worker process reads your script from its first line, and so comes to this call again: put what the"
+            ' script does below a line `if __name__ == "__main__":` (a notebook needs none)'
+        )
 
 
 def keep_freed_memory() -> None:

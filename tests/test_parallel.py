@@ -48,6 +48,38 @@ def test_the_workers_of_all_pools_come_from_one_process_that_has_imported_the_li
     assert "worker" not in peak_memory()
 
 
+def work_or_fail(folder, number):
+    """A task: the first fails, the others take a moment and leave a file."""
+    if not number:
+        raise ValueError("the first one")
+    time.sleep(0.1)
+    (folder / str(number)).touch()
+
+
+def test_after_a_failed_task_an_executor_that_is_kept_is_free_for_other_work(tmp_path):
+    with worker_processes(1) as executor:
+        with pytest.raises(ValueError, match="the first one"):
+            list(run_tasks(executor, work_or_fail, [(tmp_path, number) for number in range(40)]))
+        list(run_tasks(executor, tell_parent, [()]))
+        assert len(list(tmp_path.iterdir())) < 10  # some were on their way to the worker
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "stad_lab.pipeline.train('input', Settings.preset('quick'), 'run')",
+        "stad_lab.evaluation.evaluate('input', episodes=2, first_track=100, fast=True)",
+    ],
+)
+def test_a_script_that_its_workers_read_again_learns_the_remedy(call, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(f"import stad_lab.evaluation, stad_lab.pipeline\nfrom stad_lab import Settings\n{call}\n")
+    command = [sys.executable, "-W", "ignore", script]
+    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert process.returncode != 0
+    assert 'below a line `if __name__ == "__main__":`' in process.stderr and "in use by another" not in process.stderr
+
+
 def send_much():
     """A task whose result is a long while on its way to the parent."""
     return bytes(300_000_000)
