@@ -250,8 +250,8 @@ def main(arguments: list[str] | None = None) -> int:
             check_writable(file)
             with drivers(options.scheduler) as executor:
                 result = evaluate(*chosen, options.processes, executor)
+            print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
             save_json(file, result)
-            print(describe(result))
             print(f"  every episode: {file}")
         elif options.command == "verify":
             found = verify(options.run)

@@ -5,6 +5,7 @@ name, flushed to the disk and then renamed, so a reader sees the old version or 
 file carries a checksum of what it says, and is not used if that has changed.
 """
 
+import errno
 import hashlib
 import json
 import os
@@ -78,11 +79,14 @@ def unwritable(path: Path, error: OSError) -> OSError:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a rename in the folder last through a power cut, where the system lets a folder be opened (not Windows)."""
+    """Make a rename in the folder last through a power cut, where the system can (not on Windows and some shares)."""
     if os.name != "nt":
         opened = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(opened)
+        except OSError as error:
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+                raise
         finally:
             os.close(opened)
 

@@ -18,6 +18,7 @@ from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.autoencoder import check_variant
 from stad_lab.checkpoints import copy_file, load_json, locked, save_tensors
 from stad_lab.evolution import CONTROLLER, evolve
+from stad_lab.parallel import refuse_in_starting_worker
 from stad_lab.pipeline import EARLIER, open_record, read_finished, run_stages, set_options
 from stad_lab.search_space import COMPONENTS, START, load_directions, load_start
 from stad_lab.settings import Settings
@@ -67,6 +68,7 @@ def finish(
         FileNotFoundError: the earlier run lacks a file.
         OSError, TaskError: as `evolve`.
     """
+    refuse_in_starting_worker()
     check_variant(variant)
     earlier, folder = Path(earlier), Path(folder)
     before = check_earlier(variant, settings, earlier)

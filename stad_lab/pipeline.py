@@ -32,10 +32,10 @@ from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoenco
 from stad_lab.checkpoints import copy_file, load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
-from stad_lab.parallel import peak_memory, worker_processes
+from stad_lab.parallel import peak_memory, refuse_in_starting_worker, worker_processes
 from stad_lab.rollouts import COLLECT_FIELDS, collect_rollouts
 from stad_lab.search_space import COMPONENTS, START, find_components
-from stad_lab.second_round import carry_over, check_earlier_v, collect_again, order_of_episodes
+from stad_lab.second_round import carry_over, check_earlier_agent, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import training_device
 
@@ -76,6 +76,7 @@ def train(
         OSError: another process works in the folder, or a file cannot be read or written.
         TaskError, FloatingPointError: as raised by the stages.
     """
+    refuse_in_starting_worker()
     check_variant(variant)
     if until not in STAGES:
         raise ValueError(f"unknown stage {until!r}: choose one of {', '.join(STAGES)}")
@@ -85,7 +86,7 @@ def train(
             " episodes and the folder of the run whose agent drives them; a first round has neither"
         )
     if earlier is not None:
-        check_earlier_v(variant, settings, Path(earlier))
+        check_earlier_agent(variant, settings, Path(earlier))
     before = read_finished(Path(earlier)) if earlier is not None else None
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
@@ -185,7 +186,7 @@ def open_record(folder: Path, variant: str, settings: Settings, command: str, ea
     check_same_run(
         path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
     )
-    if record.get("earlier") != earlier:
+    if what_counts(record.get("earlier")) != what_counts(earlier):
         raise ValueError(
             f"{folder} holds a run that does not go on from the one given as it is now: choose another folder, or give"
             " the run that it goes on from"
@@ -194,6 +195,19 @@ def open_record(folder: Path, variant: str, settings: Settings, command: str, ea
     if made != starts(record)[-1]:
         record["continued_with"] = [*starts(record)[1:], made]
     return record | {"settings": settings.as_dict()}
+
+
+def what_counts(record: dict | None) -> dict | None:
+    """What a later run owes to the run of a record: not how long its stages took, and not on which machine."""
+    if record is None:
+        return None
+    settings = Settings.from_dict(record["settings"]).as_dict()
+    return {
+        "variant": record["variant"],
+        "settings": settings,
+        "budget": record.get("budget"),
+        "earlier": what_counts(record.get("earlier")),
+    }
 
 
 def starts(record: dict) -> list[dict]:
@@ -224,6 +238,7 @@ def provenance(command: str) -> dict:
         "platform": f"{platform.system()} {platform.machine()}",
         "processor": processor(),
         "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),  # V's and M's last bits depend on them
         "trained_on": str(training_device()),
         "commit": git("rev-parse", "HEAD"),
         "uncommitted_changes": changes if changes is None else bool(changes),
@@ -242,10 +257,17 @@ def processor() -> str:
 
 
 def git(*arguments: str) -> str | None:
-    """What git says about this checkout; None without git or outside a checkout."""
+    """What git says about this checkout; None without git, or if this file is not in a checkout.
+
+    An environment may lie in the checkout of something else, which does not track what is installed in it.
+    """
+    here = Path(__file__)
     try:
-        command = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+        for command in (["ls-files", "--error-unmatch", here.name], arguments):
+            found = subprocess.run(
+                ["git", "-C", str(here.parent), *command], capture_output=True, text=True, check=True
+            )
+        return found.stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stad_lab.agent import Agent, WorldModel, load_controller, read_world_model
+from stad_lab.agent import Agent, WorldModel, load_agent, load_controller, read_world_model
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum, save_tensors
 from stad_lab.controller import ACTION_SIZE, seen_columns, unpack
@@ -59,9 +59,12 @@ def collect_again(
         return collect(folder, made_with, drive_either, tasks, longest, executor)
 
 
-def check_earlier_v(variant: str, settings: Settings, earlier: Path) -> None:
-    """Raise ValueError unless the earlier V saw the indicator bar as the new one will: the frames are one dataset."""
-    seen = read_world_model(earlier, variant).crop_bar
+def check_earlier_agent(variant: str, settings: Settings, earlier: Path) -> None:
+    """Raise ValueError unless the earlier V saw the indicator bar as the new one will: the frames are one dataset.
+
+    And unless the earlier V, M and C belong together, as `load_agent` raises.
+    """
+    seen = load_agent(variant, earlier).crop_bar
     if seen != settings.crop_bar:
         raise ValueError(
             f"crop_bar={settings.crop_bar}, but the run in {earlier} has crop_bar={seen}: set that in the second round,"

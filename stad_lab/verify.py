@@ -1,7 +1,7 @@
 """Verify a run: are its files what they were, do they belong together, and does its car still drive the same way?
 
-The same seed, settings, versions and processor give equal bits in every stage. So a recorded episode can be driven
-again to the same return, and a log of CMA-ES can be told again to the same mean.
+The same seed, settings, versions, processor and number of threads give equal bits in every stage. So a recorded
+episode can be driven again to the same return, and a log of CMA-ES can be told again to the same mean.
 """
 
 import functools

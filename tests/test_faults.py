@@ -1,10 +1,12 @@
 """Broken files, broken machines and impatient people: nothing is lost, nothing is used that is not whole."""
 
+import errno
 import os
 import random
 import re
 import shutil
 import signal
+import stat
 import subprocess
 import sys
 import time
@@ -14,7 +16,7 @@ from concurrent.futures.process import BrokenProcessPool
 import pytest
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
-from stad_lab import evolution
+from stad_lab import evolution, pipeline
 from stad_lab.__main__ import main
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import train_autoencoder
@@ -23,7 +25,7 @@ from stad_lab.evaluation import evaluate
 from stad_lab.evolution import evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import TaskError, run_tasks, worker_processes
-from stad_lab.pipeline import STAGES, train
+from stad_lab.pipeline import STAGES, provenance, train
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
 from stad_lab.table import RECORDS
@@ -446,6 +448,30 @@ def test_a_file_too_large_for_the_quota_leaves_the_old_one(tmp_path):
     assert "file could not be written (File too large)" in process.stderr
     assert (tmp_path / "file").read_bytes() == b"old"
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows cannot open a folder, so none is flushed there")
+def test_a_share_that_cannot_flush_a_folder_takes_files_all_the_same(tmp_path, monkeypatch):
+    flush = os.fsync
+
+    def flush_files_alone(opened):
+        if stat.S_ISDIR(os.fstat(opened).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        flush(opened)
+
+    monkeypatch.setattr("os.fsync", flush_files_alone)
+    write_bytes(tmp_path / "file", b"new")
+    assert (tmp_path / "file").read_bytes() == b"new"
+
+
+def test_a_commit_is_only_that_of_the_checkout_that_the_library_lies_in(tmp_path, monkeypatch):
+    assert provenance("here")["commit"]
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    who = ["-c", "user.name=somebody", "-c", "user.email=somebody@example.org"]
+    subprocess.run(["git", "-C", tmp_path, *who, "commit", "-q", "--allow-empty", "-m", "Begin a thesis"], check=True)
+    monkeypatch.setattr("stad_lab.pipeline.__file__", str(shutil.copy(pipeline.__file__, tmp_path)))
+    found = provenance("there")
+    assert found["commit"] is None and found["uncommitted_changes"] is None
 
 
 # Verify

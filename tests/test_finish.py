@@ -148,7 +148,9 @@ def test_a_run_that_is_not_at_its_end_is_refused_before_anything_is_written(quic
 def test_a_finish_of_another_run_is_not_taken_for_this_one(finished, quick_run, tmp_path):
     other = shutil.copytree(quick_run, tmp_path / "other", ignore=shutil.ignore_patterns("rollouts"))
     record = load_json(other / "record.json")
-    save_json(other / "record.json", record | {"seconds": {}})
+    save_json(other / "record.json", record | {"seconds": {}})  # the same one, looked at again
+    assert not go(other, finished)
+    save_json(other / "record.json", record | {"budget": record["budget"] | {"random": {"episodes": 9, "frames": 9}}})
     with pytest.raises(
         ValueError, match=r"holds a run that does not go on from the one given as it is now: choose another"
     ):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from stad_lab.agent import load_agent, load_controller, read_world_model
+from stad_lab.agent import load_agent, load_controller, read_world_model, save_controller
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.evolution import LOG
 from stad_lab.pipeline import ship, total_budget, train
@@ -56,7 +56,7 @@ def test_a_collection_of_both_drivers_goes_on_where_it_stopped(second, quick_run
 
 
 def test_a_second_round_asks_for_the_room_that_its_two_kinds_of_episodes_may_take(quick_run, tmp_path):
-    settings = dataclasses.replace(SETTINGS, max_frames=900_000_000)
+    settings = dataclasses.replace(SETTINGS, agent_episodes=1_000_000, max_frames=1000)  # 12 TB
     with pytest.raises(OSError, match=r"up to \d+\.\d\d GB") as error:
         collect_again(VARIANT, settings, quick_run, tmp_path)
     asked = float(re.search(r"up to (\d+\.\d+) GB", str(error.value))[1])
@@ -71,6 +71,16 @@ def test_a_second_round_that_would_see_the_bar_otherwise_is_refused_before_any_w
     assert not (tmp_path / "run").exists()
 
 
+def test_a_first_round_whose_c_is_of_another_m_is_refused_before_any_work(quick_run, tmp_path):
+    folder = shutil.copytree(quick_run, tmp_path / "mixed", ignore=shutil.ignore_patterns("rollouts"))
+    parameters, facts = load_controller(folder / "controller.safetensors", VARIANT)
+    strange = {"variant": VARIANT, "autoencoder": facts["autoencoder"], "mdn_rnn": "another"}
+    save_controller(folder / "controller.safetensors", parameters, **strange)
+    with pytest.raises(ValueError, match="was made with another mdn_rnn than the one beside it"):
+        train(VARIANT, SETTINGS, tmp_path / "run", earlier=folder)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_first_round_that_is_not_at_its_end_is_refused_before_any_work(quick_run, tmp_path):
     folder = shutil.copytree(quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("rollouts"))
     log = load_json(folder / LOG)
@@ -82,7 +92,10 @@ def test_a_first_round_that_is_not_at_its_end_is_refused_before_any_work(quick_r
 
 def test_a_second_round_goes_on_only_from_the_first_as_it_was(second, quick_run, tmp_path):
     other = shutil.copytree(quick_run, tmp_path / "other", ignore=shutil.ignore_patterns("rollouts"))
-    save_json(other / "record.json", load_json(other / "record.json") | {"seconds": {}})
+    record = load_json(other / "record.json")
+    save_json(other / "record.json", record | {"seconds": {}, "peak_memory": {}})  # it was looked at again
+    assert not train(VARIANT, SETTINGS, second, earlier=other)
+    save_json(other / "record.json", record | {"budget": record["budget"] | {"random": {"episodes": 9, "frames": 9}}})
     with pytest.raises(ValueError, match="holds a run that does not go on from the one given as it is now"):
         train(VARIANT, SETTINGS, second, earlier=other)
 
