@@ -63,6 +63,7 @@ class WorkerProcesses(Executor):
     def submit(self, function: Callable, /, *arguments, **named) -> Future:
         """As for every Executor: the promise of what `function` returns."""
         task = Future()
+        task.set_running_or_notify_cancel()
         with self.lock:
             self.unfinished += 1
         self._begin(task, functools.partial(function, *arguments, **named))
@@ -102,21 +103,17 @@ class WorkerProcesses(Executor):
         except BrokenProcessPool as error:  # it broke a moment ago
             attempt = Future()
             attempt.set_exception(error)
-        task.add_done_callback(lambda task: task.cancelled() and attempt.cancel())
         attempt.add_done_callback(functools.partial(self._end, task, work, pool))
 
     def _end(self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future) -> None:
         error = BrokenProcessPool("the workers were stopped") if attempt.cancelled() else attempt.exception()
-        lost = isinstance(error, BrokenProcessPool) and not task.cancelled()
-        if lost and not self.closed.is_set() and self._replace(pool):
+        if isinstance(error, BrokenProcessPool) and not self.closed.is_set() and self._replace(pool):
             self._begin(task, work)
             return
         with self.lock:
             self.unfinished -= 1
             self.last_sign = time.monotonic()
             self.losses = 0 if error is None else self.losses
-        if not task.set_running_or_notify_cancel():
-            return
         if error is None:
             task.set_result(attempt.result())
         else:

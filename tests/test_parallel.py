@@ -48,22 +48,6 @@ def test_the_workers_of_all_pools_come_from_one_process_that_has_imported_the_li
     assert "worker" not in peak_memory()
 
 
-def work_or_fail(folder, number):
-    """A task: the first fails, the others take a moment and leave a file."""
-    if not number:
-        raise ValueError("the first one")
-    time.sleep(0.1)
-    (folder / str(number)).touch()
-
-
-def test_after_a_failed_task_an_executor_that_is_kept_is_free_for_other_work(tmp_path):
-    with worker_processes(1) as executor:
-        with pytest.raises(ValueError, match="the first one"):
-            list(run_tasks(executor, work_or_fail, [(tmp_path, number) for number in range(40)]))
-        list(run_tasks(executor, tell_parent, [()]))
-        assert len(list(tmp_path.iterdir())) < 10  # some were on their way to the worker
-
-
 @pytest.mark.parametrize(
     "call",
     [
