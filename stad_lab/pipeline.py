@@ -71,8 +71,9 @@ def train(
 
     Raises:
         ValueError: an unknown variant or stage, a folder with a run of another variant or other settings, or with a
-            file that is damaged or belongs to another run, or an earlier run whose V has seen the bar otherwise, that
-            is not at its end, or that is not as it was when this second round began.
+            file that is damaged or belongs to another run, or an earlier run whose V has seen the bar otherwise, whose
+            V, M and C do not belong together, that is not at its end, or that is not as it was when this second round
+            began.
         OSError: another process works in the folder, or a file cannot be read or written.
         TaskError, FloatingPointError: as raised by the stages.
     """
@@ -85,9 +86,9 @@ def train(
             f"agent_episodes={settings.agent_episodes} and earlier={earlier}: a second round needs both, the number of"
             " episodes and the folder of the run whose agent drives them; a first round has neither"
         )
+    before = read_finished(Path(earlier)) if earlier is not None else None
     if earlier is not None:
         check_earlier_agent(variant, settings, Path(earlier))
-    before = read_finished(Path(earlier)) if earlier is not None else None
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
     stages = {
@@ -204,7 +205,7 @@ def what_counts(record: dict | None) -> dict | None:
     settings = Settings.from_dict(record["settings"]).as_dict()
     return {
         "variant": record["variant"],
-        "settings": settings,
+        "settings": {name: value for name, value in settings.items() if name not in ("name", "processes")},
         "budget": record.get("budget"),
         "earlier": what_counts(record.get("earlier")),
     }
