@@ -2,6 +2,7 @@
 
     probe        how well six numbers of the car's true motion can be read off z, and off z and h, in every variant, in
                  a V without training, and for other strides
+    bar          the same for V and M of the second rounds, which see the indicator bar
     autoencoder  the quality of V in every variant, and rate against distortion over the weight of the KL
     mdn_rnn      the quality of M: its NLL beside simple forecasts and lesser M's, its calibration, its dreams' error
 
@@ -130,27 +131,45 @@ def begin_agent_drive(track: int) -> Drive:
 
 def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
     """Probe the latents of every variant, and of every stride, for the true motion, under two drivers."""
+    strides = {str(stride): shorter_autoencoder(settings, rollouts_folder, work, stride=stride) for stride in STRIDES}
+    drivers = two_drivers(settings, drives)
+    result = {"variants": probe_variants(settings, PRETRAINED, drivers), "strides": {}}
+    for driver, (driven, skip) in drivers.items():
+        found = result["strides"][driver] = {}
+        for stride, autoencoder in strides.items():
+            found[stride] = probe_drives(driven, skip, autoencoder, {}, int(stride), settings.crop_bar)
+    return result
+
+
+def bar_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
+    """Probe the latents of the second rounds' V and M as `probe_part` does: do they hold the gauges of the bar?"""
+    with_bar = dataclasses.replace(settings, crop_bar=False)
+    return {"variants": probe_variants(with_bar, PRETRAINED / "second_round", two_drivers(settings, drives))}
+
+
+def two_drivers(settings: Settings, drives: list[Drive]) -> dict[str, tuple[list[Drive], int]]:
+    """The two drivers under which latents are probed: name -> their drives, and how many first frames do not count."""
     by_agent = agent_drives(max(12, len(drives) // 3), settings.processes)
-    drivers = {"random driver": (drives, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
+    return {"random driver": (drives, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
+
+
+def probe_variants(settings: Settings, home: Path, drivers: dict[str, tuple[list[Drive], int]]) -> dict:
+    """Probe V and M of every variant in `home`, and V's and an M with random weights: driver -> source -> features."""
     torch.manual_seed(settings.seed)
     untrained = {
         f"{name}, untrained": AutoEncoder(name, settings.latent_size, settings.width)
         for name in ("frame", "input_output")
     }
     untrained_mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).requires_grad_(False)
-    strides = {str(stride): shorter_autoencoder(settings, rollouts_folder, work, stride=stride) for stride in STRIDES}
-    result = {"variants": {}, "strides": {}}
+    result = {}
     for driver, (driven, skip) in drivers.items():
-        found = result["variants"][driver] = {}
+        found = result[driver] = {}
         for variant in VARIANTS:
-            autoencoder, mdn_rnn, stride, crop_bar, _ = load_world_model(PRETRAINED / variant, variant)
+            autoencoder, mdn_rnn, stride, crop_bar, _ = load_world_model(home / variant, variant)
             memories = {"z, h": mdn_rnn, "z, h of an untrained M": untrained_mdn_rnn}
             found[variant] = probe_drives(driven, skip, autoencoder, memories, stride, crop_bar)
         for name, autoencoder in untrained.items():
             found[name] = probe_drives(driven, skip, autoencoder, {}, settings.stride, settings.crop_bar)
-        found = result["strides"][driver] = {}
-        for stride, autoencoder in strides.items():
-            found[stride] = probe_drives(driven, skip, autoencoder, {}, int(stride), settings.crop_bar)
     return result
 
 
@@ -319,4 +338,4 @@ def lesser_forecasts(
     return result
 
 
-PARTS = {"probe": probe_part, "autoencoder": autoencoder_part, "mdn_rnn": mdn_rnn_part}
+PARTS = {"probe": probe_part, "bar": bar_part, "autoencoder": autoencoder_part, "mdn_rnn": mdn_rnn_part}
