@@ -19,6 +19,16 @@ RECORDS = Path(__file__).parent / "records" / "table"
 # World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
 WORLD_MODELS = {25 * 64 * 16: 823.0, 50 * 64 * 16: 867.0, 200 * 64 * 16: 880.0, 1800 * 64 * 16: 900.5}
 PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # its table, on CarRacing-v0
+OTHERS = {  # the rest of that table
+    "Task-aware AE": 200.0,
+    "DQN": 343.0,
+    "DDPG": 100.0,
+    "A3C, continuous": 591.0,
+    "A3C, discrete": 652.0,
+    "OpenAI": 838.0,
+    "World Models": 906.0,
+}
+PAPER_BEST = {"best agent": 929.82, "best generation": 911.73}  # the highest points of its figures
 TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
 RESAMPLES = 10_000
 

@@ -76,12 +76,31 @@ def test_the_readme_s_speeds_are_the_benchmark_s():
 
 
 def test_the_readme_s_probe_is_the_study_s():
-    for source, found in read("study.json")["probe"]["variants"]["trained agent"].items():
+    study = read("study.json")
+    sources = study["probe"]["variants"]["trained agent"].items()
+    with_bar = [(f"{name}, with the bar", found) for name, found in study["bar"]["variants"]["trained agent"].items()]
+    for source, found in [*sources, *(pair for pair in with_bar if "untrained" not in pair[0])]:
         name, *untrained = source.split(", ")
         values = [f"{r2['r2']:.2f}" for r2 in found["z"].values()]
         if "z, h" in found:
             values = [f"{z} ({r2['r2']:.2f})" for z, r2 in zip(values, found["z, h"].values(), strict=True)]
         assert cells(", ".join([f"z of `{name}`", *untrained])) == values
+
+
+def test_the_words_on_the_probe_hold_for_the_study():
+    def r2(part, source, quantity, features="z"):
+        return round(read("study.json")[part]["variants"]["random driver"][source][features][quantity]["r2"], 2)
+
+    assert (r2("bar", "frame", "yaw rate"), r2("bar", "frame", "forward speed")) == (0.97, 0.87)
+    assert max(r2("probe", "frame", name) for name in ("yaw rate", "forward speed")) <= 0
+    assert (r2("probe", "input_output", "yaw rate"), r2("probe", "input_output", "wheel angle")) == (0.48, 0.23)
+    others = [
+        r2("probe", v, q) for v in ("frame", "input", "output") for q in ("slip speed", "yaw rate", "wheel angle")
+    ]
+    assert max(others) < 0.05
+    for quantity, share in (("slip speed", 0.1), ("forward speed", 0.15)):  # "about half"
+        assert all(abs(r2("probe", v, quantity, "z, h") - 0.5) < share for v in VARIANTS)
+    assert all(r2("bar", v, "yaw rate") <= r2("bar", "frame", "yaw rate") + 0.01 for v in VARIANTS)
 
 
 def test_the_cluster_page_says_what_the_record_says():
