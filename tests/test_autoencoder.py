@@ -20,6 +20,7 @@ from stad_lab.autoencoder import (
 from stad_lab.checkpoints import load_json, load_tensors, save_json
 from stad_lab.frames import difference_image
 from stad_lab.mdn_rnn import train_mdn_rnn
+from stad_lab.rollouts import Rollouts, save_block
 from stad_lab.settings import Settings
 
 
@@ -131,16 +132,17 @@ def test_kl_is_that_of_torch_distributions():
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-@pytest.mark.parametrize("free_bits", [0.0, 0.5])
-def test_the_loss_is_the_plain_sum_of_its_named_terms(variant, free_bits):
-    settings = Settings(kl_weight=0.7, difference_weight=3.0, free_bits=free_bits)
+@pytest.mark.parametrize("floor", ["none", "above some pictures and below others"])
+def test_the_loss_is_the_plain_sum_of_its_named_terms(variant, floor):
     autoencoder = make_autoencoder(variant)
     frame, difference, noise = make_batch()
-    losses = autoencoder_losses(autoencoder, frame, difference, noise, settings)
     mu, logvar = (part.detach().double().numpy() for part in autoencoder.encode(frame, difference))
     z = mu + np.sqrt(np.exp(logvar)) * noise.numpy()
     drawn = [None if d is None else d.detach().numpy() for d in autoencoder.decode(torch.from_numpy(z).float())]
     kl = [sum(0.5 * (m**2 + np.exp(v) - 1 - v) for m, v in zip(*row, strict=True)) for row in zip(mu, logvar)]  # noqa: B905
+    free_bits = 0.0 if floor == "none" else float(np.median(kl)) / 32
+    settings = Settings(kl_weight=0.7, difference_weight=3.0, free_bits=free_bits)
+    losses = autoencoder_losses(autoencoder, frame, difference, noise, settings)
     expected = {"kl": np.mean(kl), "frame_error": ((drawn[0] - frame.numpy()) ** 2).sum() / 3}
     total = expected["frame_error"] + 0.7 * np.mean([max(one, free_bits * 32) for one in kl])
     if "output" in variant:
@@ -193,6 +195,23 @@ def test_training_lowers_the_held_out_loss(quick_run):
     assert history[-1]["heldout"]["total"] < history[0]["heldout"]["total"]
     assert history[-1]["train"]["total"] < history[0]["train"]["total"]
     assert history[0]["train"].keys() == {"total", "frame_error", "difference_error", "kl"}
+
+
+def test_v_does_not_learn_from_held_out_episodes(quick_run, tmp_path):
+    settings, weights, losses = Settings.preset("quick", v_steps=2, v_batch=200), [], []
+    other = shutil.copytree(quick_run / "rollouts", tmp_path / "other")
+    manifest = load_json(other / "manifest.json")
+    last = manifest["blocks"][-1]
+    noise = np.random.default_rng(0).integers(256, size=(last["frames"], 64, 64, 3), dtype=np.uint8)
+    last |= save_block(other, last["index"], noise, Rollouts(other).actions[-1], last["track"])
+    save_json(other / "manifest.json", manifest)
+    for rollouts in (quick_run / "rollouts", other):
+        train_autoencoder("frame", settings, rollouts, tmp_path / f"of {rollouts.name}")
+        tensors, facts = load_tensors(tmp_path / f"of {rollouts.name}" / "autoencoder.safetensors")
+        weights.append(tensors)
+        losses.append(facts["history"][-1]["heldout"]["total"])
+    assert all(torch.equal(weights[0][name], weights[1][name]) for name in weights[0] | weights[1])
+    assert losses[1] > 2 * losses[0]
 
 
 @pytest.mark.parametrize("interrupted_in", [1, 17])

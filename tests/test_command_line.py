@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from stad_lab.__main__ import main, read_changes
+from stad_lab.__main__ import build_parser, main, read_changes
 from stad_lab.agent import save_controller
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, save_autoencoder
 from stad_lab.checkpoints import load_json, save_json
@@ -129,6 +129,9 @@ def test_help_names_every_option(command, options, capsys):
     assert [option for option in options if option not in text] == []
 
 
+COMMANDS = ["check", "train", "finish", "evaluate", "verify", "replicate", "study", "benchmark", "ship", "film"]
+
+
 def test_help_names_every_setting(capsys):
     with pytest.raises(SystemExit):
         main(["train", "--help"])
@@ -139,8 +142,17 @@ def test_help_names_every_setting(capsys):
 def test_the_first_help_names_every_command(command_line):
     process = command_line("--help")
     assert process.returncode == 0
-    for command in ("train", "evaluate", "study", "benchmark", "ship", "film"):
+    for command in COMMANDS:
         assert command in process.stdout
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_option_has_a_sentence_in_the_help(command):
+    (choices,) = (action for action in build_parser()._actions if action.dest == "command")
+    parser = choices.choices[command]
+    for action in parser._actions:
+        assert action.help, action.dest
+        assert all(option in parser.format_help() for option in action.option_strings)
 
 
 def test_until_stops_after_a_stage_and_set_changes_a_setting(tmp_path, capsys):

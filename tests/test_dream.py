@@ -4,8 +4,10 @@ import warnings
 
 import numpy as np
 import pytest
+import torch
 from gymnasium.utils.env_checker import check_env
 
+from stad_lab.controller import control
 from stad_lab.dream import DreamEnv, dream_on
 
 ACTION = np.array([0.1, 0.5, 0], np.float32)
@@ -130,6 +132,28 @@ def test_an_agent_dreams_on_without_being_changed(agent, observations):
     assert np.array_equal(again[0], pictures)
     assert np.array_equal(again[1], actions)
     assert not np.array_equal(dream_on(agent, 12, temperature=0.8, seed=4)[0], pictures)
+
+
+@torch.no_grad()
+def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent, observations):
+    for observation in observations[:10]:
+        agent.act(observation)
+    pictures, actions = dream_on(agent, 4, temperature=1e-6)
+    state, mixture = agent.state, agent.mdn_rnn.mixture(agent.state[0])
+    for picture, action in zip(pictures, actions, strict=True):  # by hand, with the likeliest z of every step
+        z = mixture.mean.gather(-1, mixture.logpi.argmax(-1, keepdim=True))[0, 0, :, 0]
+        drawn = agent.autoencoder.decode(z[None])[0][0].permute(1, 2, 0).numpy()
+        assert np.abs(drawn - picture / 255).max() < 0.02
+        seen = np.concatenate([z.numpy(), state[0][0, 0].numpy()])
+        assert control(agent.parameters, seen[None])[0] == pytest.approx(action, abs=1e-2)
+        mixture, state = agent.mdn_rnn(z[None, None], torch.from_numpy(action)[None, None], state)
+    dream = DreamEnv(agent.autoencoder, agent.mdn_rnn, 1e-6)
+    latents, _ = dream.reset(options={"latents": z.numpy(), "state": state})
+    for _ in range(3):
+        latents, _, _, _, info = dream.step(action)
+        _, state = agent.mdn_rnn(z[None, None], torch.from_numpy(action)[None, None], state)
+        z = torch.from_numpy(latents)
+        assert info["hidden"] == pytest.approx(state[0][0, 0].numpy(), abs=1e-5)
 
 
 def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):

@@ -1,12 +1,12 @@
 """Drives know the true motion of the car, and what V and M make of it is what they would make step by step."""
 
-import itertools
+import dataclasses
 
 import numpy as np
 import pytest
 import torch
 
-from stad_lab.car_racing import TRACK_WIDTH, make_env, place_car
+from stad_lab.car_racing import TRACK_WIDTH, FastCarRacing, make_env, place_car
 from stad_lab.drives import (
     MOTION,
     encode_drive,
@@ -17,7 +17,7 @@ from stad_lab.drives import (
     road_in_sight,
     true_motion,
 )
-from stad_lab.rollouts import TRACK_RANGES, drive_randomly
+from stad_lab.rollouts import TRACK_RANGES, drive_randomly, track_seeds
 from stad_lab.settings import Settings
 
 SETTINGS = Settings.preset("quick", seed=3, random_starts=1.0)
@@ -74,8 +74,16 @@ def test_a_random_drive_is_that_of_the_rollouts_on_a_track_of_its_own(random_dri
     assert not np.array_equal(random_drive.frames()[0], frames[0])  # another track
     again = record_random_drive(SETTINGS, 0)
     assert np.array_equal(again.observations, random_drive.observations)
-    ranges = sorted(TRACK_RANGES.values())
-    assert all(low[1] <= high[0] for low, high in itertools.pairwise(ranges))
+
+
+def test_a_random_drive_s_track_is_one_for_inspection(monkeypatch):
+    reset, tracks = FastCarRacing.reset, []
+    monkeypatch.setattr(
+        FastCarRacing, "reset", lambda env, **named: tracks.append(named["seed"]) or reset(env, **named)
+    )
+    record_random_drive(dataclasses.replace(SETTINGS, episode_frames=30, m_sequence=9), 1)
+    assert tracks == [track_seeds("inspect", SETTINGS.episodes, SETTINGS.seed)[1]]
+    assert TRACK_RANGES["inspect"][0] <= tracks[0] < TRACK_RANGES["inspect"][1]
 
 
 def test_an_agent_s_drive_is_recorded_as_it_was_driven(agent):

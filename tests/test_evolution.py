@@ -8,24 +8,29 @@ import subprocess
 import sys
 import time
 import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
 from stad_lab.__main__ import main
-from stad_lab.agent import load_controller
+from stad_lab.agent import drive, load_controller
 from stad_lab.checkpoints import save_json
 from stad_lab.controller import initial_parameters
 from stad_lab.evolution import (
     ask,
     averaged_mean,
+    drive_generation,
     evolve,
     fitness_curves,
     generation_tracks,
+    make_agent,
     make_strategy,
     mean_checksum,
+    note_best,
     replay,
+    validate,
 )
 from stad_lab.rollouts import TRACK_RANGES
 from stad_lab.settings import Settings
@@ -134,6 +139,41 @@ def test_the_controller_is_the_averaged_mean_that_drove_the_validation_tracks_be
     assert np.array_equal(load_controller(one_go / "controller.safetensors", "input_output")[0], best)
 
 
+def test_the_first_of_two_equally_good_looks_is_kept():
+    log = {"generations": [{"generation": 2, "validation": {"mean": 5.0}}], "best": None}
+    assert note_best(log)
+    log["generations"].append({"generation": 4, "validation": {"mean": 5.0}})
+    assert not note_best(log) and log["best"] == {"generation": 2, "validation": 5.0}
+
+
+def test_an_agent_s_returns_are_those_of_its_own_drives_on_the_tracks_of_the_generation(quick_run):
+    several = settings(tracks=2, max_frames=90)
+    population = np.array([initial_parameters(32, 32, gas=gas) for gas in (-3.0, -0.5, 0.5)])
+    with ThreadPoolExecutor(1) as executor:
+        entry = drive_generation(executor, quick_run, "input_output", several, [], population)
+    for parameters, returns in zip(population, entry["returns"], strict=True):
+        agent = make_agent(quick_run, "input_output", parameters)
+        alone = [drive(agent, [track], max_frames=90)[0][0] for track in entry["tracks"]]
+        assert returns == pytest.approx(alone, abs=1e-3)
+    assert len({tuple(returns) for returns in entry["returns"]}) == 3
+
+
+def test_an_agent_that_gets_nowhere_is_given_up_in_a_generation_and_not_in_validation(quick_run):
+    impatient, braking = settings(patience=25, max_frames=80), initial_parameters(32, 32, gas=-9.0)
+    with ThreadPoolExecutor(1) as executor:
+        entry = drive_generation(executor, quick_run, "input_output", impatient, [], np.tile(braking, (2, 1)))
+        look = validate(executor, quick_run, "input_output", impatient, braking)
+    assert entry["frames"] < 2 * 80 and look["frames"] == impatient.validation_tracks * 80
+
+
+def test_a_hard_track_is_one_on_which_the_average_agent_does_badly():
+    rested = [{"tracks": [number], "returns": [[0.0], [0.0]]} for number in range(4)]
+    back = settings(revisited_share=0.25, tracks=4)
+    for ours, other in (([0.0, 90.0], [50.0, 50.0]), ([40.0, 50.0], [0.0, 100.0])):  # 45 on average, and 50
+        returns = [[b, a, 99.0, 99.0] for a, b in zip(ours, other, strict=True)]
+        assert generation_tracks(back, [{"tracks": [10, 11, 12, 13], "returns": returns}, *rested])[0] == 11
+
+
 def test_half_of_the_generations_go_back_to_the_hardest_track_that_has_rested():
     back, log = settings(revisited_share=0.5), []
     difficulty = {}
@@ -206,31 +246,50 @@ def test_the_step_size_follows_its_plan_in_a_replay_too():
 
 
 THREADS = """
-import numpy as np
-from stad_lab.controller import initial_parameters
-from stad_lab.evolution import evolve, make_strategy, mean_checksum, threadpool_limits
+import sys
+from concurrent.futures import ThreadPoolExecutor
+import torch
+from threadpoolctl import threadpool_info
+from stad_lab import evolution
 from stad_lab.settings import Settings
-with threadpool_limits(1):
-    strategy = make_strategy(initial_parameters(32, 256), Settings.preset("laptop"))
-    for _ in range(12):
-        population = np.array(strategy.ask())
-        strategy.tell(population, (population**2).sum(axis=1))
-print(mean_checksum(strategy.mean))
+
+seen = {}
+
+def watch(name, threads):
+    real = getattr(evolution, name)
+
+    def watched(*given):
+        found = real(*given)
+        seen.setdefault(name, set()).add(threads())
+        return found
+
+    setattr(evolution, name, watched)
+
+loaded = [library["filepath"] for library in threadpool_info()]  # scipy's comes later, and the search does not use it
+
+def of_numpy():
+    return max(library["num_threads"] for library in threadpool_info() if library["filepath"] in loaded)
+
+before = of_numpy(), torch.get_num_threads()
+watch("ask", of_numpy)
+watch("drive_group", torch.get_num_threads)
+with ThreadPoolExecutor(1) as executor:
+    evolution.evolve("input_output", Settings.preset("quick", generations=2), sys.argv[1], executor)
+print(before, seen["ask"], seen["drive_group"])
 """
 
 
-def test_the_strategy_of_867_parameters_does_not_depend_on_the_number_of_threads():
-    sums = [
-        subprocess.run(
-            [sys.executable, "-c", THREADS],
-            env=os.environ | {"OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout
-        for threads in ("1", "2")
-    ]
-    assert sums[0] == sums[1] != ""
+def test_a_search_runs_on_one_thread_wherever_more_are_to_be_had(quick_run, tmp_path):
+    folder = without_evolution(quick_run, tmp_path / "run")
+    process = subprocess.run(
+        [sys.executable, "-c", THREADS, folder],
+        env=os.environ | {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    more = 2 if os.cpu_count() > 1 else 1
+    assert process.stdout == f"({more}, {more}) {{1}} {{1}}\n"
 
 
 def test_a_replay_comes_to_the_logged_means_with_any_number_of_threads():

@@ -250,7 +250,9 @@ def kill_at_random(stage, run, tmp_path, kills):
         process = subprocess.Popen(stage_command(folder, stage), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         before = STAGES.index(stage)
         while before:  # every stage before it says that there is nothing to do
-            before -= process.stdout.readline().endswith(b"nothing to do\n")
+            line = process.stdout.readline()
+            assert line, "the command ended before its stage began"
+            before -= line.endswith(b"nothing to do\n")
         begin = time.perf_counter()
         try:
             process.wait(rng.uniform(0, duration))
@@ -346,13 +348,15 @@ def test_a_worker_killed_in_mid_generation_costs_nothing_but_time(quick_run, tmp
     with worker_processes(2) as executor, ThreadPoolExecutor(1) as killer:
 
         def kill_one():
-            while not (folder / "evolution.json").exists():
+            deadline = time.time() + 120
+            while not (folder / "evolution.json").exists() and time.time() < deadline:
                 time.sleep(0.01)
             next(iter(executor.pool._processes.values())).kill()
 
         done = killer.submit(kill_one)
         evolve(VARIANT, SETTINGS, folder, executor)
         done.result()
+        assert len(executor.lost) == 1
     assert_equal_results(folder, quick_run, "controller")
 
 
@@ -500,6 +504,15 @@ def test_verify_finds_a_return_that_no_drive_gives(quick_run, tmp_path, in_this_
     save_json(folder / "record.json", record)
     drives = verify(folder, in_this_process)["drives"]
     assert re.match(r"differs: .*; but processor is '.*' and was 'a processor with", drives)
+
+
+def test_verify_drives_the_episodes_of_an_evaluation_again(whole, tmp_path, in_this_process):
+    folder = shutil.copytree(whole, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts"))
+    assert verify(folder, in_this_process)["drives"].startswith("ok")
+    told = load_json(folder / "evaluation.json")
+    told["episodes"][0]["return"] += 0.001
+    save_json(folder / "evaluation.json", told)
+    assert verify(folder, in_this_process)["drives"].startswith("FAILED: the record says")
 
 
 def test_verify_tells_of_a_controller_that_the_log_does_not_know_beside_all_that_is_well(

@@ -136,6 +136,17 @@ def test_samples_at_a_low_temperature_shrink_to_the_likeliest_mean():
     assert torch.allclose(cold.std(0), 0.1 * sigma, rtol=0.05)  # the root of the temperature
 
 
+def test_at_a_high_temperature_unlikely_gaussians_are_drawn_more_often_and_all_are_wider():
+    weights = torch.tensor([0.8, 0.15, 0.05])
+    shape = (1, 30_000, 1, 3)
+    mixture = Mixture(weights.log().expand(shape), torch.tensor([-10.0, 0.0, 10.0]).expand(shape), torch.zeros(shape))
+    drawn = sample_mixture(mixture, 4.0, torch.Generator().manual_seed(0)).flatten()
+    nearest = ((drawn + 15) / 10).floor().clamp(0, 2)
+    shares = torch.bincount(nearest.long()) / len(drawn)
+    assert torch.allclose(shares, weights**0.25 / (weights**0.25).sum(), atol=0.02)
+    assert (drawn[nearest == 1]).std() == pytest.approx(2.0, abs=0.1)
+
+
 def test_samples_repeat_with_the_generator_and_leave_torch_s_own_alone():
     state = torch.get_rng_state()
     draws = [sample_mixture(make_mixture(), 1.0, torch.Generator().manual_seed(seed)) for seed in (3, 3, 4)]
@@ -195,6 +206,36 @@ def test_a_training_without_a_sequence_for_both_losses_is_refused_before_it_begi
     with pytest.raises(ValueError, match=f"m_sequence=20, but the longest {which} episode has 10 frames: use shorter"):
         fit_mdn_rnn(tmp_path / "m", make_mdn_rnn(), "input", "v", encoded, actions, rollouts, settings)
     assert not list(tmp_path.iterdir())
+
+
+def fit_made_up(path, heldout=0.0):
+    """Train an M on made-up drives, in which the next z is the sign of the steering, and held-out ones that differ."""
+    rng = np.random.default_rng(0)
+    actions = [rng.choice([-1.0, 1.0], (40, 3)).astype(np.float32) for _ in range(12)]
+    z = [np.concatenate([np.zeros((1, 4)), np.repeat(action[:-1, :1], 4, axis=1)]) for action in actions]
+    encoded = [np.stack([one, np.full((40, 4), -8.0)]).astype(np.float32) for one in z]
+    encoded[-1][0] += heldout
+    episode = np.repeat(np.arange(12), 40)
+    parts = np.flatnonzero(episode < 11), np.flatnonzero(episode == 11)
+    rollouts = SimpleNamespace(episode=episode, identity=f"made up {heldout}", split=lambda: parts)
+    settings = Settings.preset("quick", m_sequence=20, m_steps=60, m_learning_rate=2e-2)
+    fit_mdn_rnn(path, make_mdn_rnn(hidden_size=16), "input", "v", encoded, actions, rollouts, settings)
+    return *load_mdn_rnn(path), actions[-1], encoded[-1][0]
+
+
+def test_m_learns_what_comes_next(tmp_path):
+    mdn_rnn, _, actions, z = fit_made_up(tmp_path / "m.safetensors")
+    mixture, _ = mdn_rnn(torch.from_numpy(z)[None], torch.from_numpy(actions)[None])
+    expected = (mixture.logpi.exp() * mixture.mean).sum(-1)[0, :, 0]
+    assert np.corrcoef(expected.detach(), actions[:, 0])[0, 1] > 0.9
+
+
+def test_m_does_not_learn_from_held_out_episodes(tmp_path):
+    (one, told, *_), (other, told_otherwise, *_) = (
+        fit_made_up(tmp_path / f"{heldout}.safetensors", heldout) for heldout in (0.0, 5.0)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True))
+    assert told_otherwise["history"][-1]["heldout"]["total"] > told["history"][-1]["heldout"]["total"] + 1
 
 
 def test_training_lowers_the_held_out_loss(quick_run):

@@ -40,6 +40,25 @@ def test_what_identifies_a_drive_is_not_mistaken_for_a_signal():
     assert probe(features, targets, drives)["r2"][0] < 0.1
 
 
+def test_an_interval_is_over_drives_and_does_not_narrow_if_their_rows_are_repeated():
+    rng, (features, targets, drives) = np.random.default_rng(0), planted(drives=20, length=10)
+    targets = targets + rng.standard_normal(20)[drives][:, None]  # drives differ
+    once, often = (probe(*(np.repeat(part, n, axis=0) for part in (features, targets, drives))) for n in (1, 30))
+    widths = [found["high"] - found["low"] for found in (once, often)]
+    assert widths[1] == pytest.approx(widths[0], rel=0.3)
+
+
+def test_the_penalty_is_chosen_on_drives_that_the_r2_is_not_measured_on(monkeypatch):
+    asked = []
+    monkeypatch.setattr("stad_lab.probe.choose_penalties", lambda *given: asked.append(given[2:]) or np.ones(2))
+    features, targets, drives = planted()
+    found = probe(features, targets, drives)["r2"]
+    ((fit, trial),) = asked
+    assert not set(drives[fit]) & set(drives[trial]) and len(set(drives[fit | trial])) == 24  # of forty
+    targets[fit | trial] = 0.0  # what is measured are the others: nothing that was fitted is left
+    assert found[0] > 0.7 and probe(features, targets + 1e-9 * features[:, :2], drives)["r2"][0] < 0.1
+
+
 def test_the_same_seed_gives_the_same_numbers():
     first, second = probe(*planted(), seed=4), probe(*planted(), seed=4)
     assert all(np.array_equal(first[name], second[name]) for name in first)

@@ -8,13 +8,15 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from stad_lab.__main__ import main
+from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum, save_json
-from stad_lab.frames import difference_image, episode_differences
+from stad_lab.frames import difference_image, episode_differences, to_frame
 from stad_lab.rollouts import (
     TRACK_RANGES,
     RandomDriver,
@@ -111,6 +113,18 @@ def test_a_block_can_be_driven_again(quick_run):
     assert track == rollouts.manifest["blocks"][3]["track"]
 
 
+@pytest.mark.parametrize("crop_bar", [True, False])
+def test_an_action_stands_beside_the_frame_that_the_driver_saw(crop_bar):
+    settings = Settings.preset("quick", random_starts=0.0, crop_bar=crop_bar)
+    frames, actions, track = drive_randomly(settings, 1)
+    env = make_env()
+    observation, _ = env.reset(seed=track)
+    for frame, action in zip(frames, actions, strict=True):
+        assert np.array_equal(frame, to_frame(observation, crop_bar))
+        observation, *_ = env.step(action)
+    env.close()
+
+
 def test_frames_are_uint8_and_actions_float32(quick_run):
     rollouts = Rollouts(quick_run / "rollouts")
     for frames, actions in zip(rollouts.frames, rollouts.actions, strict=True):
@@ -182,6 +196,12 @@ def test_whole_episodes_are_held_out(quick_run):
     assert sorted([*training, *heldout]) == list(range(len(rollouts)))
     assert len(training) > len(heldout) > 0
     assert not set(rollouts.episode[training]) & set(rollouts.episode[heldout])
+
+
+def test_the_last_twentieth_of_the_episodes_is_held_out():
+    episode = np.repeat(np.arange(40), 3)
+    training, heldout = Rollouts.split(SimpleNamespace(frames=range(40), episode=episode))
+    assert training.tolist() == list(range(38 * 3)) and heldout.tolist() == list(range(38 * 3, 40 * 3))
 
 
 def test_the_four_uses_share_no_track():

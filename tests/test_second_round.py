@@ -10,10 +10,12 @@ import pytest
 from safetensors.numpy import load_file
 
 from stad_lab.agent import load_agent, load_controller, read_world_model, save_controller
+from stad_lab.car_racing import FastCarRacing, make_env
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.evolution import LOG
+from stad_lab.frames import to_frame
 from stad_lab.pipeline import ship, total_budget, train
-from stad_lab.rollouts import Rollouts, drive_randomly
+from stad_lab.rollouts import TRACK_RANGES, Rollouts, drive_randomly, track_seeds
 from stad_lab.search_space import features, load_start
 from stad_lab.second_round import carry_over, collect_again, drive_noisily, fit_controller, order_of_episodes, outputs
 from stad_lab.settings import Settings
@@ -25,11 +27,27 @@ SETTINGS = Settings.preset("quick", agent_episodes=3, processes=1)
 
 @pytest.fixture(scope="module")
 def second(quick_run, tmp_path_factory):
-    """The folder of a second round after the quick run."""
-    folder = tmp_path_factory.mktemp("second") / "run"
-    with ThreadPoolExecutor(1) as executor:
+    """The folder of a second round after the quick run; the tracks that were driven for it are in `tracks.json`."""
+    folder, tracks, reset = tmp_path_factory.mktemp("second") / "run", [], FastCarRacing.reset
+
+    def note(env, *, seed=None, options=None):
+        tracks.append(seed)
+        return reset(env, seed=seed, options=options)
+
+    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as executor:
+        patch.setattr(FastCarRacing, "reset", note)
         assert train(VARIANT, SETTINGS, folder, executor=executor, earlier=quick_run)
+    save_json(folder.parent / "tracks.json", {"tracks": tracks})
     return folder
+
+
+def test_no_track_of_the_tests_or_for_inspection_is_driven_for_a_run(second):
+    tracks = load_json(second.parent / "tracks.json")["tracks"]
+    driven = {use: [track for track in tracks if low <= track < high] for use, (low, high) in TRACK_RANGES.items()}
+    assert driven["test"] == driven["inspect"] == [] and sum(map(len, driven.values())) == len(tracks)
+    assert len(driven["collect"]) == SETTINGS.episodes + SETTINGS.agent_episodes
+    assert len(driven["evolve"]) == SETTINGS.generations * SETTINGS.population
+    assert set(driven["validate"]) == set(track_seeds("validate", SETTINGS.validation_tracks))
 
 
 def test_the_dataset_holds_the_episodes_of_both_drivers(second, quick_run, agent):
@@ -109,6 +127,25 @@ def test_an_unsteady_hand_differs_between_episodes_and_m_remembers_what_was_done
     assert np.array_equal(drive_noisily(agent, SETTINGS, 0)[1], actions)
     assert not np.array_equal(drive_noisily(agent, SETTINGS, 1)[1], actions)
     assert (actions >= [-1, 0, 0]).all() and (actions <= 1).all()
+
+
+def test_an_unsteady_hand_wanders_and_every_episode_s_by_another_size(agent):
+    sizes = []
+    for episode in range(3):
+        frames, actions, track = drive_noisily(agent, SETTINGS, episode)
+        env, noise = make_env(fast=True), []
+        observation, _ = env.reset(seed=track)
+        agent.reset()
+        for frame, action in zip(frames, actions, strict=True):
+            assert np.array_equal(frame, to_frame(observation, SETTINGS.crop_bar))
+            before, meant = agent.state, agent.act(observation)
+            agent.take_in(action[None], before)
+            noise.append(action[0] - meant[0])
+            observation, *_ = env.step(action)
+        env.close()
+        sizes.append(np.std(noise))
+        assert np.corrcoef(noise[1:], noise[:-1])[0, 1] > 0.5
+    assert min(sizes) > 1e-3 and max(sizes) > 1.5 * min(sizes)
 
 
 def test_evolution_starts_from_what_the_earlier_agent_knew(second, quick_run):

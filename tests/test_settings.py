@@ -99,6 +99,8 @@ def test_values_that_do_not_go_together_are_refused():
         Settings(episode_frames=80)
     with pytest.raises(ValueError, match=r"episode_frames=20, but with stride=30 .*use more than 30 frames"):
         Settings(episode_frames=20, stride=30, m_sequence=5)
+    with pytest.raises(ValueError, match=r"generations=54 is not a multiple of validate_every=5: the last"):
+        Settings(generations=54)
 
 
 def test_every_setting_has_its_sentence():
