@@ -211,7 +211,9 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
 
     Args:
         variant: "frame", "input", "output" or "input_output".
-        path: the folder of a run; None for the one that comes with stad_lab.
+        path: the folder of a run; None for the one that comes with stad_lab. For "input" that is the agent of one long
+            search that the notebooks show, without the bar and no match for the other three, which a second round and
+            a finish have made: to compare variants, give `pretrained/second_round/input`.
 
     Raises:
         ValueError: an unknown variant, or files that are damaged or belong to another variant or size.

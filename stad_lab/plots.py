@@ -14,12 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from PIL import Image, ImageDraw, ImageFont
 
-from stad_lab.drives import Drive, Inside
+from stad_lab.drives import MOTION, Drive, Inside
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
-STYLES = tuple((color, dash) for dash in ("-", "--", "-.", ":") for color in COLORS)  # where there may be many lines
-MARKERS = "os^DvP"  # beside the colours: to colour-blind eyes GREEN and PURPLE are two greys
+DASHES = ("-", "--", "-.", ":")
+# Of lines: to colour-blind eyes GREEN and PURPLE are two greys, so they differ in more than colour.
+STYLES = tuple((color, DASHES[(place + turn) % 4]) for turn in range(4) for place, color in enumerate(COLORS))
+MARKERS = "os^DvP"
 DIFFERENCE_MAP = "PuOr_r"
 
 
@@ -109,7 +111,8 @@ def plot_bars(values: dict[str, np.ndarray], title: str, xlabel: str, ylabel: st
         axis.set_xlabel(xlabel, fontsize=9)
     axes[0, 0].set_ylabel(ylabel)
     figure.suptitle(title, fontsize=11)
-    figure.set_label(f"{title}. Bars sorted from high to low for {', '.join(values)}.")
+    told = ", ".join(f"{name} from {max(array):.3g} to {min(array):.3g}" for name, array in values.items())
+    figure.set_label(f"{title}. Bars sorted from high to low: {told}.")
     return figure
 
 
@@ -120,12 +123,12 @@ def plot_mixture(
     figure, ((axis,),) = new_figure(6.5, 3.4)
     reach = 4 * np.exp(logsigma) * np.sqrt(max(temperatures))
     z = np.linspace((mean - reach).min(), (mean + reach).max(), 600)
-    for temperature, color in zip(temperatures, itertools.cycle(COLORS), strict=False):
+    for temperature, (color, dash) in zip(temperatures, itertools.cycle(STYLES), strict=False):
         weights = np.exp((logpi - logpi.max()) / temperature)
         weights /= weights.sum()
         sigma = np.exp(logsigma) * np.sqrt(temperature)
         parts = weights * np.exp(-0.5 * ((z[:, None] - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-        axis.plot(z, parts.sum(axis=1), color=color, lw=2, label=f"temperature {temperature:g}")
+        axis.plot(z, parts.sum(axis=1), dash, color=color, lw=2, label=f"temperature {temperature:g}")
         if len(temperatures) == 1:
             axis.plot(z, parts, color="grey", lw=0.8, ls=":")
     if actual is not None:
@@ -157,14 +160,15 @@ def plot_curves(
     many = len(curves) > 4  # then the names stand beside the lines
     figure, ((axis,),) = new_figure(7.5 if many else 6.5, 3.2)
     shapes = itertools.cycle(MARKERS if many and marker else [marker])
-    for (name, values), color, shape in zip(curves.items(), itertools.cycle(COLORS), shapes, strict=False):
+    for (name, values), (color, dash), shape in zip(curves.items(), itertools.cycle(STYLES), shapes, strict=False):
         places = np.arange(1, len(values) + 1) if x is None else x
-        axis.plot(places, values, color=color, label=name, marker=shape)
+        axis.plot(places, values, dash, color=color, label=name, marker=shape)
     axis.set(xlabel=xlabel, ylabel=ylabel, **axis_settings)
     beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5)} if many else {}
     axis.legend(frameon=False, fontsize=9, **beside)
     axis.set_title(title, fontsize=11)
-    figure.set_label(f"{title}. Lines: {', '.join(curves)}.")
+    told = ", ".join(f"{name} from {values[0]:.3g} to {values[-1]:.3g}" for name, values in curves.items())
+    figure.set_label(f"{title}. Lines: {told}.")
     return figure
 
 
@@ -211,7 +215,16 @@ def plot_intervals(
         ]
         figure.legend(handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
-    figure.set_label(f"{title}. Panels: {', '.join(filter(None, panels)) or 'one'}; rows: {', '.join(rows)}.")
+    count = sum(len(found) for contenders in panels.values() for found in contenders.values())
+    told = names if count <= 40 else names[:1]  # more than that, nobody would listen to
+    values = [
+        " ".join(filter(None, (panel, row, name, f"{contenders[row][name][0]:.3g}")))
+        for panel, contenders in panels.items()
+        for row in rows
+        for name in told
+        if name in contenders[row]
+    ]
+    figure.set_label(f"{title}. {'; '.join(values)}.")
     return figure
 
 
@@ -254,13 +267,15 @@ def plot_rate_distortion(rates: np.ndarray, errors: np.ndarray, names: list[str]
 def plot_shares(shares: dict[str, np.ndarray], title: str, xlabel: str) -> Figure:
     """Histograms of numbers in [0, 1] as outlines, each bar as a multiple of what a uniform one would have."""
     figure, ((axis,),) = new_figure(6.5, 3.2)
-    for (name, share), color in zip(shares.items(), itertools.cycle(COLORS), strict=False):
-        axis.stairs(share * len(share), np.linspace(0, 1, len(share) + 1), color=color, lw=1.8, label=name)
+    for (name, share), (color, dash) in zip(shares.items(), itertools.cycle(STYLES), strict=False):
+        edges = np.linspace(0, 1, len(share) + 1)
+        axis.stairs(share * len(share), edges, color=color, ls=dash, lw=1.8, label=name)
     axis.axhline(1, color="black", lw=1, ls="--", label="uniform")
     axis.set(xlabel=xlabel, ylabel="density", ylim=(0, None))
     axis.legend(frameon=False, fontsize=9)
     axis.set_title(title, fontsize=11)
-    figure.set_label(f"{title}. Histograms of {', '.join(shares)} against a uniform one.")
+    told = ", ".join(f"{name} {min(s) * len(s):.2g} to {max(s) * len(s):.2g}" for name, s in shares.items())
+    figure.set_label(f"{title}. Histograms against a uniform one, which is 1: {told}.")
     return figure
 
 
@@ -272,7 +287,7 @@ def plot_map(points: np.ndarray, colors: dict[str, np.ndarray], title: str) -> F
         drawn = axis.scatter(*points.T, c=values, s=3, cmap="cividis", vmin=low, vmax=high)
         axis.set(xticks=[], yticks=[], xlabel="first principal component")
         axis.set_title(name, fontsize=9)
-        figure.colorbar(drawn, ax=axis, shrink=0.9)
+        figure.colorbar(drawn, ax=axis, shrink=0.9, label=MOTION.get(name, ""))
     axes[0, 0].set_ylabel("second")
     figure.suptitle(title, fontsize=11)
     figure.set_label(f"{title}. {len(points)} points, coloured by {', '.join(colors)}.")

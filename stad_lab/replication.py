@@ -25,7 +25,7 @@ from tqdm.auto import tqdm
 from stad_lab.autoencoder import AutoEncoder
 from stad_lab.benchmark import save_pair, train_m, train_v
 from stad_lab.car_racing import make_env
-from stad_lab.checkpoints import checksum, copy_file, load_json, save_json
+from stad_lab.checkpoints import checksum, copy_file, load_json, load_tensors, save_json
 from stad_lab.controller import initial_parameters, squash
 from stad_lab.evaluation import SOLVED, evaluate, report
 from stad_lab.evolution import CONTROLLER, LOG, drive_generation
@@ -161,9 +161,10 @@ def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
 def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
-    With them go the records of the first round and of the world, if the row has its own. Seeds that are made elsewhere,
-    in a folder without seed 0, may have V and M from another training by the same settings. If so, the records of that
-    one go to `first_of_seed1` and `world_of_seed1`, by the first of these seeds; if not, they are there already.
+    With them go the records and the losses of the first round and of the world, if the row has its own. Seeds that are
+    made elsewhere, in a folder without seed 0, may have V and M from another training by the same settings. If so, the
+    records of that one go to `first_of_seed1` and `world_of_seed1`, by the first of these seeds; if not, they are there
+    already.
     """
     kept = []
     for seed in (0,) if name in FLOORS else find_row(name).seeds:
@@ -177,7 +178,14 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
         if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
             own = part if with_seed_0 else f"{part}_of_{kept[0].name}"
             copy_records(Path(folder) / name / part, target / name / own)
+            keep_histories(Path(folder) / name / part, target / name / own)
     return kept
+
+
+def keep_histories(source: Path, target: Path) -> None:
+    """Write how the losses of V and M went, which their weights tell and which stay behind: `histories.json`."""
+    files = {part: source / f"{part}.safetensors" for part in ("autoencoder", "mdn_rnn")}
+    save_json(target / "histories.json", {part: load_tensors(file)[1]["history"] for part, file in files.items()})
 
 
 def copy_records(source: Path, target: Path) -> None:

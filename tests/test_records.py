@@ -75,6 +75,29 @@ def test_the_readme_s_speeds_are_the_benchmark_s():
             assert cells(label) == [f"{value['median']:,.0f}", f"{value['ratio']:.1f}"]
 
 
+def test_the_readme_s_other_figures_are_those_of_the_records():
+    benchmark, study = read("benchmark.json"), read("study.json")
+    for label, part in (
+        ("V as shipped (width 16)", "images a second, V of width 16"),
+        ("V of World Models' width (32)", "images a second, V of width 32"),
+        ("M", "frames a second, M at paper settings"),
+    ):
+        plain, ours = (benchmark["training"][part][name] for name in ("plain", "stad_lab"))
+        assert cells(label) == [f"{plain['median']:,.0f}", f"{ours['median']:,.0f}", f"{ours['ratio']:.2f}"]
+    parts = benchmark["loop"]["microseconds of a frame, 16 cars in one process"]
+    names = ("V", "physics", "picture", "preparation", "reset", "M", "C", "all else")
+    told = ", ".join(f"{name} {parts[name]:.0f}" for name in names).replace("preparation 34,", "preparation 34,\n")
+    assert f"takes {parts['together']:.0f} microseconds: {told}".replace("\n ", "\n") in README
+    crowd = [f"{found['median']:,.0f}" for found in benchmark["loop"]["frames a second, cars in one process"].values()]
+    assert ", ".join(crowd) in README
+    (parity,) = benchmark["parity"].values()
+    around = parity["window of 24 x 24 around the car, mean"]
+    assert f"by {parity['whole picture, mean']:.2f} of 255 on average, and by {around:.2f} in the 24 x 24" in README
+    nll = study["mdn_rnn"]["variants"]["input"]["nll"]
+    nats = [f"{nll[name]['nats']:.3f}" for name in ("M", "linear, last z", "repeat the last z")]
+    assert "at {} nats per latent, against {} for a linear law and {} for repeating".format(*nats) in README
+
+
 def test_the_readme_s_probe_is_the_study_s():
     study = read("study.json")
     sources = study["probe"]["variants"]["trained agent"].items()
@@ -130,6 +153,14 @@ def test_the_readme_s_rows_are_the_replication_s():
         counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}", f"{found['frames'] / 1e6:.2f} M"]
         scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
         assert cells(f"`{name}`") == [seeds, f"{found['worlds']}", *scores, *counts]
+
+
+def test_the_results_tell_how_the_drives_of_a_row_spread():
+    for name, folders in kept_rows().items():
+        returns, found = official_returns(folders), summarise(folders)
+        failed = f"{(returns < 800).sum()} of {returns.size}"
+        told = [f"{found['standard_deviation']:.0f}", f"{np.median(returns):.1f}", failed, f"{found['top_90']:.1f}"]
+        assert cells(f"`{name}`: spread", RESULTS) == told
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

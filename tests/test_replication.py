@@ -168,7 +168,9 @@ def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     assert [path.name for path in kept] == ["seed0", "seed1"] and summarise(kept) == summaries["two"]
     assert keep("one", folder, tmp_path) == []
     sizes = [path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()]
-    assert len(sizes) == 2 * 4 + 3 + 1 and max(sizes) < 200_000  # neither V nor M; a first round is not evaluated
+    assert len(sizes) == 2 * 4 + 4 + 2 and max(sizes) < 200_000  # neither V nor M; a first round is not evaluated
+    histories = load_json(tmp_path / "two" / "world" / "histories.json")
+    assert histories["mdn_rnn"][-1]["step"] == load_json(kept[0] / "record.json")["settings"]["m_steps"]
     assert (tmp_path / "two" / "first" / "evolution.json").read_bytes() == (
         folder / "two" / "first" / "evolution.json"
     ).read_bytes()
