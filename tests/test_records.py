@@ -30,6 +30,8 @@ RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
 README = (Path(__file__).parent.parent / "README.md").read_text()
 RESULTS = (Path(__file__).parent.parent / "docs" / "results.md").read_text()
 STAGES = ("two_rounds", "finished")
+NOTEBOOK = (Path(__file__).parent.parent / "notebooks" / "05_replication.ipynb").read_text()
+NUMBERS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 CLUSTER = (Path(__file__).parent.parent / "docs" / "cluster.md").read_text()
 
 
@@ -195,6 +197,16 @@ def test_the_drives_with_the_fast_renderer_are_those_of_the_agents_before_and_af
             assert [episode["track"] for episode in found["episodes"]] == list(range(first, first + 100))
             assert found["renderer"] == "fast"
             assert found["controller_sha256"] == load_json(folder / "evaluation.json")["controller_sha256"]
+
+
+def test_the_runs_of_the_paper_s_recipe_are_counted_in_words():
+    rows = {name: row for name, row in ROWS.items() if name.startswith("paper_")}
+    made = sum(len(folders) for name, folders in kept_rows().items() if name in rows)
+    missing = sum(len(row.seeds) for row in rows.values()) - made
+    assert made + missing == 12
+    assert f"{NUMBERS[made].capitalize()} of its twelve runs are made" in README
+    assert f"the {NUMBERS[missing]} missing runs" in README
+    assert f"{NUMBERS[missing]} of twelve runs are missing" in NOTEBOOK
 
 
 def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
