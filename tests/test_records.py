@@ -221,9 +221,14 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
         assert returns[name].mean(axis=1).min() > 906
     medians = {variant: np.median(returns[f"two_rounds_{variant}"]) for variant in VARIANTS}
     assert max(medians, key=medians.get) == "output" and np.ptp(list(medians.values())) < 5
-    for name in ("paper_frame", "paper_input"):  # validation flatters by about a hundred points
+    for name in ("paper_frame", "paper_input", "paper_output"):  # validation flatters by about a hundred points
         best = load_json(rows[name][0] / LOG)["best"]["validation"]
         assert 90 < best - returns[name][0].mean() < 110
+    means = {v: returns[f"paper_{v}"].mean() for v in ("frame", "input", "output")}
+    assert [round(float(means[v] - means["frame"])) for v in ("input", "output")] == [175, 190]
+    last = {v: learning_curve(rows[f"paper_{v}"][0])[1][-5:].mean() for v in means}
+    assert [round(float(last[v] - last["frame"])) for v in ("input", "output")] == [25, 156]
+    assert [load_json(rows[f"paper_{v}"][0] / LOG)["best"]["generation"] for v in means] == [580, 160, 400]
     looks = learning_curve(rows["paper_frame"][0])[1]
     assert looks[-5:].argmax() == looks[-5:].tolist().index(looks.max()) == 3
     assert round(float(np.delete(looks[-5:], 3).mean() - returns["paper_frame"].mean())) == 57  # nobody chose these
