@@ -13,6 +13,7 @@ import shutil
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,6 +24,7 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from stad_lab import load_agent, make_env
 from stad_lab.agent import load_controller
+from stad_lab.car_racing import FastCarRacing
 from stad_lab.checkpoints import save_tensors
 from stad_lab.controller import initial_parameters
 from stad_lab.settings import Settings
@@ -131,6 +133,25 @@ def observations():
         seen.append(env.step(env.action_space.sample())[0])
     env.close()
     return seen
+
+
+@pytest.fixture(scope="session")
+def noted_tracks():
+    """with noted_tracks() as tracks: the seeds with which cars are set on a track in this process go into the list."""
+
+    @contextmanager
+    def note():
+        tracks, reset = [], FastCarRacing.reset
+
+        def noting(env, *, seed=None, options=None):
+            tracks.append(seed)
+            return reset(env, seed=seed, options=options)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(FastCarRacing, "reset", noting)
+            yield tracks
+
+    return note
 
 
 @pytest.fixture

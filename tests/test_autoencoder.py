@@ -250,11 +250,11 @@ def test_v_and_m_of_other_rollouts_are_refused(quick_run, tmp_path):
 
 
 def test_v_and_m_of_other_settings_are_refused(quick_run, tmp_path):
-    for part, train in (("autoencoder", train_autoencoder), ("mdn_rnn", train_mdn_rnn)):
+    changes = ("autoencoder", train_autoencoder, "kl_weight", 16.0), ("mdn_rnn", train_mdn_rnn, "m_learning_rate", 0.5)
+    for part, train, name, value in changes:
         shutil.copy(quick_run / f"{part}.safetensors", tmp_path)
-        for name, value in {"autoencoder": {"kl_weight": 16.0}, "mdn_rnn": {"m_learning_rate": 0.5}}[part].items():
-            with pytest.raises(ValueError, match=rf"{part}.safetensors holds a run with {name}=.*now {name}={value}"):
-                train("input_output", Settings.preset("quick", **{name: value}), quick_run / "rollouts", tmp_path)
+        with pytest.raises(ValueError, match=rf"{part}.safetensors holds a run with {name}=.*now {name}={value}"):
+            train("input_output", Settings.preset("quick", **{name: value}), quick_run / "rollouts", tmp_path)
 
 
 def test_a_training_state_that_a_killed_process_left_behind_is_cleared_away(quick_run, tmp_path):

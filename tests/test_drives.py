@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from stad_lab.car_racing import TRACK_WIDTH, FastCarRacing, make_env, place_car
+from stad_lab.car_racing import TRACK_WIDTH, make_env, place_car
 from stad_lab.drives import (
     MOTION,
     encode_drive,
@@ -76,12 +76,9 @@ def test_a_random_drive_is_that_of_the_rollouts_on_a_track_of_its_own(random_dri
     assert np.array_equal(again.observations, random_drive.observations)
 
 
-def test_a_random_drive_s_track_is_one_for_inspection(monkeypatch):
-    reset, tracks = FastCarRacing.reset, []
-    monkeypatch.setattr(
-        FastCarRacing, "reset", lambda env, **named: tracks.append(named["seed"]) or reset(env, **named)
-    )
-    record_random_drive(dataclasses.replace(SETTINGS, episode_frames=30, m_sequence=9), 1)
+def test_a_random_drive_s_track_is_one_for_inspection(noted_tracks):
+    with noted_tracks() as tracks:
+        record_random_drive(dataclasses.replace(SETTINGS, episode_frames=30, m_sequence=9), 1)
     assert tracks == [track_seeds("inspect", SETTINGS.episodes, SETTINGS.seed)[1]]
     assert TRACK_RANGES["inspect"][0] <= tracks[0] < TRACK_RANGES["inspect"][1]
 

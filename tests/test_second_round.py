@@ -10,7 +10,7 @@ import pytest
 from safetensors.numpy import load_file
 
 from stad_lab.agent import load_agent, load_controller, read_world_model, save_controller
-from stad_lab.car_racing import FastCarRacing, make_env
+from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.evolution import LOG
 from stad_lab.frames import to_frame
@@ -26,16 +26,10 @@ SETTINGS = Settings.preset("quick", agent_episodes=3, processes=1)
 
 
 @pytest.fixture(scope="module")
-def second(quick_run, tmp_path_factory):
+def second(quick_run, tmp_path_factory, noted_tracks):
     """The folder of a second round after the quick run; the tracks that were driven for it are in `tracks.json`."""
-    folder, tracks, reset = tmp_path_factory.mktemp("second") / "run", [], FastCarRacing.reset
-
-    def note(env, *, seed=None, options=None):
-        tracks.append(seed)
-        return reset(env, seed=seed, options=options)
-
-    with pytest.MonkeyPatch.context() as patch, ThreadPoolExecutor(1) as executor:
-        patch.setattr(FastCarRacing, "reset", note)
+    folder = tmp_path_factory.mktemp("second") / "run"
+    with noted_tracks() as tracks, ThreadPoolExecutor(1) as executor:
         assert train(VARIANT, SETTINGS, folder, executor=executor, earlier=quick_run)
     save_json(folder.parent / "tracks.json", {"tracks": tracks})
     return folder
