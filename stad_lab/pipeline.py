@@ -86,8 +86,9 @@ def train(
             f"agent_episodes={settings.agent_episodes} and earlier={earlier}: a second round needs both, the number of"
             " episodes and the folder of the run whose agent drives them; a first round has neither"
         )
-    before = read_finished(Path(earlier)) if earlier is not None else None
+    before = None
     if earlier is not None:
+        before = read_finished(Path(earlier))
         check_earlier_agent(variant, settings, Path(earlier))
     folder = Path(folder)
     rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
