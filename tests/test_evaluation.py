@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stad_lab import load_agent
+from stad_lab.__main__ import main
 from stad_lab.checkpoints import checksum, load_json
 from stad_lab.evaluation import describe, evaluate, summarise
 from stad_lab.rollouts import TRACK_RANGES
@@ -52,18 +53,17 @@ def test_every_episode_is_on_record(fast):
 
 
 def test_an_evaluation_goes_to_the_screen_and_to_a_file_that_is_not_the_official_one_s(
-    straight_run, fast, tmp_path, command_line
+    straight_run, fast, tmp_path, capsys
 ):
     run = shutil.copytree(straight_run, tmp_path / "run")
     arguments = ["evaluate", "--variant", "input_output", "--path", run, "--fast", "--episodes", 2]
-    process = command_line(*arguments, "--first-track", 10, "--processes", 1)
-    assert process.returncode == 0, process.stderr
+    assert main([str(argument) for argument in (*arguments, "--first-track", 10, "--processes", 1)]) == 0
+    told = capsys.readouterr().out
     file = run / "evaluation-input_output-fast-from-10-2-tracks.json"
     result = load_json(file)
     assert result | {"seconds": 0} == fast | {"seconds": 0}  # one process or two: the same numbers
     assert result["seconds"] > 0
-    assert describe(fast) in process.stdout
-    assert str(file) in process.stdout
+    assert describe(fast) in told and str(file) in told
 
 
 def test_a_result_names_the_controller_that_drove_if_a_search_finds_a_better_one_meanwhile(

@@ -482,10 +482,10 @@ def test_a_commit_is_only_that_of_the_checkout_that_the_library_lies_in(tmp_path
 # Verify
 
 
-def test_verify_drives_recorded_episodes_again(quick_run, command_line):
-    process = command_line("verify", quick_run)
-    assert process.returncode == 0, process.stdout
-    found = dict(line.split(maxsplit=1) for line in process.stdout.replace("log of CMA-ES", "log").splitlines())
+def test_verify_drives_recorded_episodes_again(quick_run, capsys):
+    assert main(["verify", str(quick_run)]) == 0
+    told = capsys.readouterr().out.replace("log of CMA-ES", "log")
+    found = dict(line.split(maxsplit=1) for line in told.splitlines())
     assert found["rollouts"] == "ok: 8 episodes, 480 frames"
     assert found["log"] == "ok: 4 generations lead to the same mean"
     assert re.fullmatch(r"ok: .* points, to the last bit as recorded", found["drives"])

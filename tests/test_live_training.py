@@ -1,30 +1,16 @@
 """Training in a real kernel: the stop button ends a cell in one line, and the same cell goes on, bit for bit."""
 
-import json
 import os
-import shutil
 
 import pytest
 from jupyter_client.manager import start_new_kernel
 from safetensors.torch import load_file
 
 from stad_lab import Settings
-from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import train_autoencoder
-from stad_lab.evolution import evolve
 from stad_lab.rollouts import collect_rollouts
 
-EVOLVE = """
-from pathlib import Path
-from stad_lab import Settings
-from stad_lab.evolution import evolve, fitness_curves
-from stad_lab.plots import plot_evolution
-from stad_lab.widgets import watch_training
-settings = Settings.preset("quick", processes=1, generations=8, max_frames=30, hidden_size=256)
-draw = lambda log: plot_evolution(fitness_curves(log), {}, f"generation {len(log)}")
-print("complete:", watch_training(lambda watch: evolve("input", settings, Path(FOLDER), watch=watch), draw))
-"""
-TRAIN_V = """
+TRAIN = """
 from pathlib import Path
 from stad_lab import Settings
 from stad_lab.autoencoder import train_autoencoder
@@ -67,17 +53,13 @@ def run_cell(kernel, code, interrupt_after=None):
     return "".join(printed), figures, None if reply["status"] == "ok" else reply["ename"]
 
 
-@pytest.mark.parametrize("which", ["C", "V"])
-def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(which, kernel, tmp_path):
+def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(kernel, tmp_path):
+    settings = Settings.preset("quick", v_steps=60, processes=1)
+    collect_rollouts(settings, tmp_path / "rollouts")
     stopped, straight = tmp_path / "stopped", tmp_path / "straight"
     for folder in (stopped, straight):
         folder.mkdir()
-        if which == "C":
-            for name in ("autoencoder.safetensors", "mdn_rnn.safetensors"):
-                shutil.copy(PRETRAINED / "input" / name, folder / name)
-    if which == "V":
-        collect_rollouts(Settings.preset("quick", processes=1), tmp_path / "rollouts")
-    cell = f"FOLDER = {str(stopped)!r}\n" + (EVOLVE if which == "C" else TRAIN_V)
+    cell = f"FOLDER = {str(stopped)!r}\n{TRAIN}"
 
     printed, figures, error = run_cell(kernel, cell, interrupt_after=2)
     assert error is None and "stopped: nothing that was logged is lost" in printed and "complete: False" in printed
@@ -87,13 +69,6 @@ def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(which, 
     printed, last, error = run_cell(kernel, cell)
     assert error is None and last == again[-1:]  # a finished training is shown, not repeated
 
-    if which == "C":
-        settings = Settings.preset("quick", processes=1, generations=8, max_frames=30, hidden_size=256)
-        evolve("input", settings, straight)
-        logs = [json.loads((folder / "evolution.json").read_text()) for folder in (stopped, straight)]
-        assert logs[0] == logs[1] and len(logs[0]["generations"]) == 8
-    else:
-        settings = Settings.preset("quick", v_steps=60, processes=1)
-        train_autoencoder("frame", settings, tmp_path / "rollouts", straight)
-        weights = [load_file(folder / "autoencoder.safetensors") for folder in (stopped, straight)]
-        assert all(weights[0][name].equal(weights[1][name]) for name in weights[1])
+    train_autoencoder("frame", settings, tmp_path / "rollouts", straight)
+    weights = [load_file(folder / "autoencoder.safetensors") for folder in (stopped, straight)]
+    assert all(weights[0][name].equal(weights[1][name]) for name in weights[1])
