@@ -8,7 +8,7 @@ import contextlib
 import dataclasses
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
@@ -41,154 +41,73 @@ def build_parser() -> argparse.ArgumentParser:
         prog="python -m stad_lab", description="Teach a car to drive with a model of its world (STAD)."
     )
     commands = parser.add_subparsers(dest="command", required=True)
+    for add in (
+        add_check,
+        add_train,
+        add_finish,
+        add_evaluate,
+        add_verify,
+        add_replicate,
+        add_study,
+        add_benchmark,
+        add_ship,
+        add_film,
+    ):
+        add(commands)
+    return parser
 
-    variant = argparse.ArgumentParser(add_help=False)
-    variant.add_argument(
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
+    options = build_parser().parse_args(arguments)
+    try:
+        return options.do(options) or 0
+    except (ValueError, OSError, FloatingPointError, TaskError, BrokenProcessPool) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        resumes = options.command in ("train", "finish", "study", "replicate")
+        print(f"\nstopped{'; the same command goes on from the last checkpoint' * resumes}", file=sys.stderr)
+        return 130
+
+
+# What several commands share
+
+
+def add_variant(command: argparse.ArgumentParser) -> None:
+    """The option --variant."""
+    command.add_argument(
         "--variant",
         required=True,
         help=f"which pictures V sees and redraws: {', '.join(VARIANTS)} (frame is World Models; input adds the"
         " difference image to what V sees, output to what it redraws)",
     )
 
-    repeated = {"action": "append", "default": [], "metavar": "NAME=VALUE"}
 
-    commands.add_parser("check", help="is everything installed, and what to do about what is not")
-    scheduler = argparse.ArgumentParser(add_help=False)
-    scheduler.add_argument(
+def add_path(command: argparse.ArgumentParser) -> None:
+    """The option --path, of a run or of the agent that comes with stad_lab."""
+    command.add_argument("--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab")
+
+
+def add_scheduler(command: argparse.ArgumentParser) -> None:
+    """The option --scheduler."""
+    command.add_argument(
         "--scheduler",
         metavar="ADDRESS",
         help="drive on a Dask cluster, for example tcp://10.0.0.1:8786; default: processes of this machine",
     )
 
-    command = commands.add_parser(
-        "train",
-        parents=[variant, scheduler],
-        help="collect, train V, train M, evolve C",
-        description="Run all four stages. Stop it when you like; the same command goes on where it stopped.",
-    )
-    command.add_argument(
-        "--settings", help=f"preset: {', '.join(PRESETS)}; default: $STAD_LAB_SETTINGS, or else laptop"
-    )
-    command.add_argument("--out", required=True, type=Path, help="folder of the run, for example runs/input")
-    command.add_argument("--rollouts", type=Path, help="folder of the rollouts, to share them; default OUT/rollouts")
-    command.add_argument(
-        "--earlier",
-        type=Path,
-        metavar="RUN",
-        help="a second round: this run's agent drives agent_episodes for the rollouts, and C goes on from its C",
-    )
-    command.add_argument("--until", default=STAGES[-1], help=f"last stage to run: {', '.join(STAGES)}; default all")
-    command.add_argument(
-        "--set",
-        **repeated,
-        help="change one setting of the preset, for example --set stride=2; may be repeated."
-        f" The settings: {', '.join(field.name for field in dataclasses.fields(Settings))}",
-    )
 
-    command = commands.add_parser(
-        "finish",
-        parents=[variant, scheduler],
-        help="search on from a run's C, with several tracks for every agent",
-        description="Search on from the C of a finished run, with its V and M and with several tracks for every agent,"
-        " so that failures grow rare. Stop it when you like; the same command goes on where it stopped.",
-    )
-    command.add_argument("--path", type=Path, help="folder of the run; default: the agent that comes with stad_lab")
-    command.add_argument("--out", required=True, type=Path, help="folder of the finish, for example runs/finished")
+def add_changes(command: argparse.ArgumentParser, help: str) -> None:
+    """The option --set."""
+    command.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=help)
+
+
+def add_parts(command: argparse.ArgumentParser, parts: Iterable[str]) -> None:
+    """The option --part."""
     command.add_argument(
-        "--set",
-        **repeated,
-        help="change one setting of the finish; may be repeated. It is the run's, but for"
-        f" {', '.join(f'{name}={value}' for name, value in FINISH.items())}. These may change: {', '.join(OPEN)}",
+        "--part", action="append", choices=list(parts), help="only this part; may be repeated; default all"
     )
-
-    command = commands.add_parser(
-        "evaluate",
-        parents=[variant, scheduler],
-        help="drive an agent on official, unseen tracks",
-        description="Drive an agent on Gymnasium's own CarRacing-v3 and print mean, deviation, interval and share"
-        " above 900; every episode goes into a JSON file.",
-    )
-    command.add_argument("--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab")
-    command.add_argument("--episodes", type=int, default=100, help="number of tracks, default 100")
-    command.add_argument("--first-track", type=int, default=0, help="seed of the first track, default 0")
-    command.add_argument("--fast", action="store_true", help="draw with the fast renderer (not for reports)")
-    command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
-    command.add_argument(
-        "--json",
-        type=Path,
-        help="where to write the result; default evaluation-VARIANT.json in the run, or here; -fast, -from-TRACK"
-        " or -N-tracks is added to the name if it is not the official evaluation",
-    )
-
-    command = commands.add_parser(
-        "verify",
-        help="check a run's files, and drive three of its recorded episodes again",
-        description="Check that the files of a run are what they were and belong together, and that recorded episodes"
-        " can be driven again to the same return. The exit status is 1 if anything is not as it was.",
-    )
-    command.add_argument("run", type=Path, help="folder of the run")
-
-    command = commands.add_parser(
-        "replicate",
-        parents=[scheduler],
-        help="make a row of the replication's table",
-        description="Make one row of the table: V and M, a search for C for every seed, 100 official tracks for each C"
-        " found. It says first how long it will take; stop it when you like, the same command goes on.",
-    )
-    command.add_argument("--row", required=True, help=f"one of {', '.join([*ROWS, *FLOORS])}")
-    command.add_argument("--out", required=True, type=Path, help="folder of all rows, for example runs/table")
-    command.add_argument("--seeds", type=int, nargs="+", help="of the searches for C; all of the row's without it")
-    command.add_argument(
-        "--keep", action="store_true", help="only copy the records of the finished seeds to stad_lab/records/table"
-    )
-
-    command = commands.add_parser(
-        "study",
-        help="measure what the latents know, and how good V and M are",
-        description="Measure the V and M that come with stad_lab on unseen drives: a linear probe for the car's true"
-        " motion, V's errors, M's likelihood, calibration and dreams. What it compares them with is trained first,"
-        " which takes an hour or two; stop it when you like, the same command goes on.",
-    )
-    command.add_argument("--settings", help="preset of what is trained; default: as for train")
-    command.add_argument("--out", required=True, type=Path, help="folder for what is trained, and for study.json")
-    command.add_argument("--rollouts", type=Path, help="folder of the rollouts; default OUT/rollouts")
-    command.add_argument(
-        "--part", action="append", choices=list(STUDY_PARTS), help="only this part; may be repeated; default all"
-    )
-
-    command = commands.add_parser(
-        "benchmark",
-        help="measure speeds side by side with Gymnasium and EnvPool",
-        description="Let the fast renderer, the loop and the training take turns with the usual ways to do the same"
-        " work, on a machine that does nothing else; without the part cluster it takes about eight minutes. EnvPool"
-        " takes part if it is installed.",
-    )
-    command.add_argument(
-        "--part", action="append", choices=list(PARTS), help="only this part; may be repeated; default all"
-    )
-    command.add_argument("--rounds", type=int, default=5, help="how often the contenders take turns, default 5")
-    command.add_argument("--json", type=Path, default=Path("benchmark.json"), help="where to write every measurement")
-
-    command = commands.add_parser(
-        "ship", parents=[variant], help="copy a run's weights and records to stad_lab/pretrained"
-    )
-    command.add_argument("--path", type=Path, required=True, help="folder of the run")
-
-    command = commands.add_parser(
-        "film",
-        parents=[variant],
-        help="make a moving picture of an agent driving",
-        description="Observation, difference image and reconstruction side by side, as an animated GIF.",
-    )
-    command.add_argument("--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab")
-    command.add_argument("--out", type=Path, required=True, help="the GIF to write; with --viewer it may be a .webp")
-    command.add_argument(
-        "--viewer", action="store_true", help="film everything: latents, forecast, action and return too"
-    )
-    command.add_argument("--track", type=int, default=5, help="seed of the track, default 5")
-    command.add_argument("--first", type=int, default=60, help="first frame shown, default 60: after the opening zoom")
-    command.add_argument("--frames", type=int, default=240, help="frames covered, default 240; every third is shown")
-    return parser
 
 
 def read_changes(changes: list[str]) -> dict:
@@ -220,84 +139,268 @@ def drivers(scheduler: str | None) -> Iterator[Executor | None]:
             yield executor
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
-    options = build_parser().parse_args(arguments)
-    try:
-        if options.command == "check":
-            print(report := check_environment())
-            return 0 if report.ok else 1
-        elif options.command == "train":
-            settings = Settings.preset(options.settings, **read_changes(options.set))
-            with drivers(options.scheduler) as executor:
-                chosen = (options.variant, settings, options.out, options.rollouts, options.until)
-                worked = train(*chosen, executor, options.earlier)
-            if not worked:
-                print(f"everything up to {options.until} is there in {options.out}: nothing to do")
-        elif options.command == "finish":
-            check_variant(options.variant)
-            earlier = run_folder(options.variant, options.path)
-            settings = finish_settings(earlier, **read_changes(options.set))
-            with drivers(options.scheduler) as executor:
-                if not finish(options.variant, settings, earlier, options.out, executor):
-                    print(f"the finish is there in {options.out}: nothing to do")
-        elif options.command == "evaluate":
-            other = "-fast" * options.fast + f"-from-{options.first_track}" * (options.first_track != 0)
-            other += f"-{options.episodes}-tracks" * (options.episodes != 100)
-            file = options.json or (options.path or Path()) / f"evaluation-{options.variant}{other}.json"
-            chosen = (options.variant, options.path, options.episodes, options.first_track, options.fast)
-            load_agent(*chosen[:2])
-            check_writable(file)
-            with drivers(options.scheduler) as executor:
-                result = evaluate(*chosen, options.processes, executor)
-            print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
-            save_json(file, result)
-            print(f"  every episode: {file}")
-        elif options.command == "verify":
-            found = verify(options.run)
-            print("\n".join(f"{name:<14} {outcome}" for name, outcome in found.items()))
-            return int(any(outcome.startswith("FAILED") for outcome in found.values()))
-        elif options.command == "replicate" and options.keep:
-            print("\n".join(f"kept in {folder}" for folder in keep(options.row, options.out)) or "no seed is finished")
-        elif options.command == "replicate":
-            with drivers(options.scheduler) as executor:
-                print(describe_forecast(options.row, forecast(options.row, options.seeds)), flush=True)
-                print(describe_row(options.row, replicate(options.row, options.out, executor, options.seeds)))
-        elif options.command == "study":
-            settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
-            file, parts = options.out / "study.json", options.part or list(STUDY_PARTS)
-            check_writable(file)
-            study(settings, rollouts, options.out, parts)
-            print(f"every measurement: {file}")
-        elif options.command == "benchmark":
-            check_writable(options.json)
-            benchmark(options.part or list(PARTS), options.rounds, options.json)
-            print(f"\nevery measurement: {options.json}")
-        elif options.command == "ship":
-            print(f"shipped to {ship(options.variant, options.path)}")
-        elif options.command == "film":
-            from stad_lab.film import film_agent, film_viewer  # matplotlib takes a second, and workers import this file
+# The commands
 
-            agent = load_agent(options.variant, options.path)
-            shown = (agent, options.track, options.first, options.frames)
-            kind = options.out.suffix.lstrip(".").lower()
-            if not options.viewer and kind != "gif":
-                raise ValueError(f"--out {options.out}: expected a file that ends in .gif (or, with --viewer, .webp)")
-            check_writable(options.out)
-            write_bytes(options.out, film_viewer(*shown, kind=kind) if options.viewer else film_agent(*shown))
-            print(f"filmed to {options.out}")
-    except (ValueError, OSError, FloatingPointError, TaskError, BrokenProcessPool) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        again = (
-            "; the same command goes on from the last checkpoint"
-            if options.command in ("train", "finish", "study", "replicate")
-            else ""
-        )
-        print(f"\nstopped{again}", file=sys.stderr)
-        return 130
-    return 0
+
+def add_check(commands: argparse._SubParsersAction) -> None:
+    """The command check."""
+    command = commands.add_parser("check", help="is everything installed, and what to do about what is not")
+    command.set_defaults(do=do_check)
+
+
+def do_check(options: argparse.Namespace) -> int:
+    """Say whether everything that stad_lab needs is here."""
+    print(report := check_environment())
+    return 0 if report.ok else 1
+
+
+def add_train(commands: argparse._SubParsersAction) -> None:
+    """The command train."""
+    command = commands.add_parser(
+        "train",
+        help="collect, train V, train M, evolve C",
+        description="Run all four stages. Stop it when you like; the same command goes on where it stopped.",
+    )
+    add_variant(command)
+    add_scheduler(command)
+    command.add_argument(
+        "--settings", help=f"preset: {', '.join(PRESETS)}; default: $STAD_LAB_SETTINGS, or else laptop"
+    )
+    command.add_argument("--out", required=True, type=Path, help="folder of the run, for example runs/input")
+    command.add_argument("--rollouts", type=Path, help="folder of the rollouts, to share them; default OUT/rollouts")
+    command.add_argument(
+        "--earlier",
+        type=Path,
+        metavar="RUN",
+        help="a second round: this run's agent drives agent_episodes for the rollouts, and C goes on from its C",
+    )
+    command.add_argument("--until", default=STAGES[-1], help=f"last stage to run: {', '.join(STAGES)}; default all")
+    add_changes(
+        command,
+        "change one setting of the preset, for example --set stride=2; may be repeated."
+        f" The settings: {', '.join(field.name for field in dataclasses.fields(Settings))}",
+    )
+    command.set_defaults(do=do_train)
+
+
+def do_train(options: argparse.Namespace) -> None:
+    """Run the stages."""
+    settings = Settings.preset(options.settings, **read_changes(options.set))
+    with drivers(options.scheduler) as executor:
+        chosen = (options.variant, settings, options.out, options.rollouts, options.until)
+        worked = train(*chosen, executor, options.earlier)
+    if not worked:
+        print(f"everything up to {options.until} is there in {options.out}: nothing to do")
+
+
+def add_finish(commands: argparse._SubParsersAction) -> None:
+    """The command finish."""
+    command = commands.add_parser(
+        "finish",
+        help="search on from a run's C, with several tracks for every agent",
+        description="Search on from the C of a finished run, with its V and M and with several tracks for every agent,"
+        " so that failures grow rare. Stop it when you like; the same command goes on where it stopped.",
+    )
+    add_variant(command)
+    add_scheduler(command)
+    add_path(command)
+    command.add_argument("--out", required=True, type=Path, help="folder of the finish, for example runs/finished")
+    add_changes(
+        command,
+        "change one setting of the finish; may be repeated. It is the run's, but for"
+        f" {', '.join(f'{name}={value}' for name, value in FINISH.items())}. These may change: {', '.join(OPEN)}",
+    )
+    command.set_defaults(do=do_finish)
+
+
+def do_finish(options: argparse.Namespace) -> None:
+    """Search on."""
+    check_variant(options.variant)
+    earlier = run_folder(options.variant, options.path)
+    settings = finish_settings(earlier, **read_changes(options.set))
+    with drivers(options.scheduler) as executor:
+        if not finish(options.variant, settings, earlier, options.out, executor):
+            print(f"the finish is there in {options.out}: nothing to do")
+
+
+def add_evaluate(commands: argparse._SubParsersAction) -> None:
+    """The command evaluate."""
+    command = commands.add_parser(
+        "evaluate",
+        help="drive an agent on official, unseen tracks",
+        description="Drive an agent on Gymnasium's own CarRacing-v3 and print mean, deviation, interval and share"
+        " above 900; every episode goes into a JSON file.",
+    )
+    add_variant(command)
+    add_scheduler(command)
+    add_path(command)
+    command.add_argument("--episodes", type=int, default=100, help="number of tracks, default 100")
+    command.add_argument("--first-track", type=int, default=0, help="seed of the first track, default 0")
+    command.add_argument("--fast", action="store_true", help="draw with the fast renderer (not for reports)")
+    command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
+    command.add_argument(
+        "--json",
+        type=Path,
+        help="where to write the result; default evaluation-VARIANT.json in the run, or here; -fast, -from-TRACK"
+        " or -N-tracks is added to the name if it is not the official evaluation",
+    )
+    command.set_defaults(do=do_evaluate)
+
+
+def do_evaluate(options: argparse.Namespace) -> None:
+    """Drive the tracks, and write every episode."""
+    other = "-fast" * options.fast + f"-from-{options.first_track}" * (options.first_track != 0)
+    other += f"-{options.episodes}-tracks" * (options.episodes != 100)
+    file = options.json or (options.path or Path()) / f"evaluation-{options.variant}{other}.json"
+    chosen = (options.variant, options.path, options.episodes, options.first_track, options.fast)
+    load_agent(*chosen[:2])
+    check_writable(file)
+    with drivers(options.scheduler) as executor:
+        result = evaluate(*chosen, options.processes, executor)
+    print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
+    save_json(file, result)
+    print(f"  every episode: {file}")
+
+
+def add_verify(commands: argparse._SubParsersAction) -> None:
+    """The command verify."""
+    command = commands.add_parser(
+        "verify",
+        help="check a run's files, and drive three of its recorded episodes again",
+        description="Check that the files of a run are what they were and belong together, and that recorded episodes"
+        " can be driven again to the same return. The exit status is 1 if anything is not as it was.",
+    )
+    command.add_argument("run", type=Path, help="folder of the run")
+    command.set_defaults(do=do_verify)
+
+
+def do_verify(options: argparse.Namespace) -> int:
+    """Say of every file what was found."""
+    found = verify(options.run)
+    print("\n".join(f"{name:<14} {outcome}" for name, outcome in found.items()))
+    return int(any(outcome.startswith("FAILED") for outcome in found.values()))
+
+
+def add_replicate(commands: argparse._SubParsersAction) -> None:
+    """The command replicate."""
+    command = commands.add_parser(
+        "replicate",
+        help="make a row of the replication's table",
+        description="Make one row of the table: V and M, a search for C for every seed, 100 official tracks for each C"
+        " found. It says first how long it will take; stop it when you like, the same command goes on.",
+    )
+    add_scheduler(command)
+    command.add_argument("--row", required=True, help=f"one of {', '.join([*ROWS, *FLOORS])}")
+    command.add_argument("--out", required=True, type=Path, help="folder of all rows, for example runs/table")
+    command.add_argument("--seeds", type=int, nargs="+", help="of the searches for C; all of the row's without it")
+    command.add_argument(
+        "--keep", action="store_true", help="only copy the records of the finished seeds to stad_lab/records/table"
+    )
+    command.set_defaults(do=do_replicate)
+
+
+def do_replicate(options: argparse.Namespace) -> None:
+    """Make the row, or keep what is made of it."""
+    if options.keep:
+        kept = keep(options.row, options.out, seeds=options.seeds)
+        print("\n".join(f"kept in {folder}" for folder in kept) or "no seed is finished")
+        return
+    with drivers(options.scheduler) as executor:
+        print(describe_forecast(options.row, forecast(options.row, options.seeds)), flush=True)
+        print(describe_row(options.row, replicate(options.row, options.out, executor, options.seeds)))
+
+
+def add_study(commands: argparse._SubParsersAction) -> None:
+    """The command study."""
+    command = commands.add_parser(
+        "study",
+        help="measure what the latents know, and how good V and M are",
+        description="Measure the V and M that come with stad_lab on unseen drives: a linear probe for the car's true"
+        " motion, V's errors, M's likelihood, calibration and dreams. What it compares them with is trained first,"
+        " which takes an hour or two; stop it when you like, the same command goes on.",
+    )
+    command.add_argument("--settings", help="preset of what is trained; default: as for train")
+    command.add_argument("--out", required=True, type=Path, help="folder for what is trained, and for study.json")
+    command.add_argument("--rollouts", type=Path, help="folder of the rollouts; default OUT/rollouts")
+    add_parts(command, STUDY_PARTS)
+    command.set_defaults(do=do_study)
+
+
+def do_study(options: argparse.Namespace) -> None:
+    """Measure the parts."""
+    settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
+    file = options.out / "study.json"
+    check_writable(file)
+    study(settings, rollouts, options.out, options.part or list(STUDY_PARTS))
+    print(f"every measurement: {file}")
+
+
+def add_benchmark(commands: argparse._SubParsersAction) -> None:
+    """The command benchmark."""
+    command = commands.add_parser(
+        "benchmark",
+        help="measure speeds side by side with Gymnasium and EnvPool",
+        description="Let the fast renderer, the loop and the training take turns with the usual ways to do the same"
+        " work, on a machine that does nothing else; without the part cluster it takes about eight minutes. EnvPool"
+        " takes part if it is installed.",
+    )
+    add_parts(command, PARTS)
+    command.add_argument("--rounds", type=int, default=5, help="how often the contenders take turns, default 5")
+    command.add_argument("--json", type=Path, default=Path("benchmark.json"), help="where to write every measurement")
+    command.set_defaults(do=do_benchmark)
+
+
+def do_benchmark(options: argparse.Namespace) -> None:
+    """Measure the parts."""
+    check_writable(options.json)
+    benchmark(options.part or list(PARTS), options.rounds, options.json)
+    print(f"\nevery measurement: {options.json}")
+
+
+def add_ship(commands: argparse._SubParsersAction) -> None:
+    """The command ship."""
+    command = commands.add_parser("ship", help="copy a run's weights and records to stad_lab/pretrained")
+    add_variant(command)
+    command.add_argument("--path", type=Path, required=True, help="folder of the run")
+    command.set_defaults(do=do_ship)
+
+
+def do_ship(options: argparse.Namespace) -> None:
+    """Copy them."""
+    print(f"shipped to {ship(options.variant, options.path)}")
+
+
+def add_film(commands: argparse._SubParsersAction) -> None:
+    """The command film."""
+    command = commands.add_parser(
+        "film",
+        help="make a moving picture of an agent driving",
+        description="Observation, difference image and reconstruction side by side, as an animated GIF.",
+    )
+    add_variant(command)
+    add_path(command)
+    command.add_argument("--out", type=Path, required=True, help="the GIF to write; with --viewer it may be a .webp")
+    command.add_argument(
+        "--viewer", action="store_true", help="film everything: latents, forecast, action and return too"
+    )
+    command.add_argument("--track", type=int, default=5, help="seed of the track, default 5")
+    command.add_argument("--first", type=int, default=60, help="first frame shown, default 60: after the opening zoom")
+    command.add_argument("--frames", type=int, default=240, help="frames covered, default 240; every third is shown")
+    command.set_defaults(do=do_film)
+
+
+def do_film(options: argparse.Namespace) -> None:
+    """Drive, and write the picture."""
+    from stad_lab.film import film_agent, film_viewer  # matplotlib takes a second, and workers import this file
+
+    agent = load_agent(options.variant, options.path)
+    shown = (agent, options.track, options.first, options.frames)
+    kind = options.out.suffix.lstrip(".").lower()
+    if not options.viewer and kind != "gif":
+        raise ValueError(f"--out {options.out}: expected a file that ends in .gif (or, with --viewer, .webp)")
+    check_writable(options.out)
+    write_bytes(options.out, film_viewer(*shown, kind=kind) if options.viewer else film_agent(*shown))
+    print(f"filmed to {options.out}")
 
 
 if __name__ == "__main__":

@@ -31,18 +31,14 @@ class Agent:
 
     Args:
         parameters: of C, (parameters,) or one row for each car (cars, parameters).
-        stride: k of the difference image.
+        stride: k of the difference image, as V was trained.
         crop_bar: whether V was trained on frames without the indicator bar.
+
+    Raises:
+        ValueError: parameters of another number than V's latents and M's memory ask for.
     """
 
-    def __init__(
-        self,
-        autoencoder: AutoEncoder,
-        mdn_rnn: MDNRNN,
-        parameters: np.ndarray,
-        stride: int = 4,
-        crop_bar: bool = True,
-    ):
+    def __init__(self, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, parameters: np.ndarray, stride: int, crop_bar: bool):
         check_parameters(parameters, parameter_count(autoencoder.latent_size, mdn_rnn.hidden_size))
         self.autoencoder, self.mdn_rnn, self.parameters = autoencoder, mdn_rnn, parameters
         self.stride, self.crop_bar = stride, crop_bar
@@ -180,7 +176,7 @@ def read_world_model(folder: Path, variant: str) -> WorldModel:
     """V and M of a run. Raises ValueError if they do not belong together, and as `load_autoencoder`."""
     autoencoder, v_facts = load_autoencoder(folder / "autoencoder.safetensors", variant)
     path = folder / "mdn_rnn.safetensors"
-    mdn_rnn, m_facts = load_mdn_rnn(path, variant, autoencoder.latent_size)
+    mdn_rnn, m_facts = load_mdn_rnn(path, variant)
     check_partner(path, m_facts, autoencoder=v_facts["identity"])
     identities = {"autoencoder": v_facts["identity"], "mdn_rnn": m_facts["identity"]}
     return WorldModel(autoencoder, mdn_rnn, v_facts["stride"], v_facts["crop_bar"], identities)

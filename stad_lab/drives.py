@@ -47,8 +47,8 @@ class Drive:
     def __len__(self) -> int:
         return len(self.actions)
 
-    def frames(self, crop_bar: bool = True) -> np.ndarray:
-        """What V sees of it: uint8 (T, 64, 64, 3)."""
+    def frames(self, crop_bar: bool) -> np.ndarray:
+        """What V sees of it: uint8 (T, 64, 64, 3). Whether without the indicator bar, is as V was trained."""
         return np.array([to_frame(observation, crop_bar) for observation in self.observations])
 
 
@@ -147,28 +147,25 @@ class Inside:
     """What M expects after the frame and the action: parts (1, T, latent_size, mixtures)."""
 
 
-def encode_drive(
-    autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: bool = True
-) -> tuple[np.ndarray, np.ndarray]:
-    """What V makes of a drive: mu and logvar of z, float32 (T, latent_size) each."""
+def encode_drive(autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: bool) -> tuple[np.ndarray, np.ndarray]:
+    """What V makes of a drive: mu and logvar of z, float32 (T, latent_size) each; stride and bar as V was trained."""
     return tuple(encode_frames(autoencoder, drive.frames(crop_bar), stride))
 
 
 @torch.no_grad()
-def remember_drive(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, Mixture]:
-    """M's memory before every frame, float32 (T, hidden_size), and the mixture that it expects after it."""
-    seen = (torch.from_numpy(part)[None] for part in (latents, actions))
-    after, _ = mdn_rnn.remember(*seen, None)
-    before = torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)
-    return before[0].numpy(), mdn_rnn.mixture(after)
+def remember_drive(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """M's memory before every frame of a drive: mu (T, latent_size), actions (T, 3) -> float32 (T, hidden_size)."""
+    after, _ = mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)
+    return torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)[0].numpy()
 
 
 @torch.no_grad()
-def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool = True) -> Inside:
-    """Show V and M a drive from its first frame on, and keep everything they make of it."""
+def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool) -> Inside:
+    """Show V and M a drive from its first frame on, and keep all they make of it; stride and bar as V was trained."""
     frames = drive.frames(crop_bar)
     mu, logvar = encode_frames(autoencoder, frames, stride)
-    hidden, mixture = remember_drive(mdn_rnn, mu, drive.actions)
+    hidden = remember_drive(mdn_rnn, mu, drive.actions)
+    mixture, _ = mdn_rnn(torch.from_numpy(mu)[None], torch.from_numpy(drive.actions)[None])
     drawn, changed = autoencoder.decode(torch.from_numpy(mu))
     changed = None if changed is None else to_array(changed)
     return Inside(frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, logvar, hidden, mixture)

@@ -9,15 +9,15 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from stad_lab.agent import load_agent, run_folder
 from stad_lab.checkpoints import checksum
 from stad_lab.evolution import CONTROLLER, drive_group, hand_out
-from stad_lab.parallel import run_tasks, worker_processes
+from stad_lab.parallel import run_in_order, worker_processes
 from stad_lab.rollouts import TRACK_RANGES
 
 SOLVED = 900  # CarRacing counts as solved at a mean return of 900 over 100 tracks
+RESAMPLES = 10_000  # of a bootstrap
 
 
 def evaluate(
@@ -41,8 +41,9 @@ def evaluate(
         executor: who drives; None for so many processes of this machine.
 
     Returns:
-        A dict for JSON: "mean", "standard_deviation", "interval" (95%, of the mean), "above_900" (share of episodes),
-        "seconds" that it took, and for every episode its "track", "return" and "frames".
+        A dict for JSON: "variant", "renderer" ("official" or "fast"), "controller_sha256" of C's file, "mean",
+        "standard_deviation", "interval" (95%, of the mean), "above_900" (share of episodes), "seconds" that it took,
+        and "episodes": the "track", "return" and "frames" of each.
 
     Raises:
         ValueError: tracks outside the range that is kept for tests, or an agent that cannot be loaded.
@@ -57,30 +58,29 @@ def evaluate(
         )
     agent = load_agent(variant, path)
     folder = run_folder(variant, path)
-    driven = checksum((folder / CONTROLLER).read_bytes())  # now, since a search may find a better one meanwhile
+    controller = checksum((folder / CONTROLLER).read_bytes())  # now, since a search may find a better one meanwhile
     begin = time.perf_counter()
     tracks = list(range(first_track, first_track + episodes))
     with worker_processes(processes, executor) as executor:
         # One car at a time: in a batch the last bits differ, and a script that drives alone should get these numbers.
         source = hand_out(executor, folder, variant)
         tasks = [(source, variant, agent.parameters, [track], fast, None) for track in tracks]
-        results = tqdm(run_tasks(executor, drive_group, tasks), f"evaluate ({variant})", len(tasks), unit="episode")
-        found = dict(results)
-    returns, frames = (np.concatenate(part) for part in zip(*(found[n] for n in range(len(tasks))), strict=True))
+        driven = run_in_order(executor, drive_group, tasks, f"evaluate ({variant})")
+    returns, lengths = (np.concatenate(part) for part in zip(*driven, strict=True))
     return {
         "variant": variant,
         "renderer": "fast" if fast else "official",
-        "controller_sha256": driven,
-        **report(tracks, returns, frames),
+        "controller_sha256": controller,
+        **report(tracks, returns, lengths),
         "seconds": time.perf_counter() - begin,
     }
 
 
-def report(tracks: list[int], returns: np.ndarray, frames: np.ndarray) -> dict:
-    """What `summarise` says of the returns, float (n,), and every episode: its track, return and frames, (n,) each."""
+def report(tracks: list[int], returns: np.ndarray, lengths: np.ndarray) -> dict:
+    """What `summarise` says of the returns, float (n,), and every episode: its track, return and length in frames."""
     episodes = [
         {"track": track, "return": float(value), "frames": int(length)}
-        for track, value, length in zip(tracks, returns, frames, strict=True)
+        for track, value, length in zip(tracks, returns, lengths, strict=True)
     ]
     return {**summarise(returns), "episodes": episodes}
 
@@ -90,7 +90,7 @@ def summarise(returns: np.ndarray) -> dict:
     return {
         "mean": float(returns.mean()),
         "standard_deviation": float(returns.std(ddof=1)) if len(returns) > 1 else 0.0,
-        "interval": bootstrap_interval(returns, 10_000),
+        "interval": bootstrap_interval(returns, RESAMPLES),
         "above_900": float((returns > SOLVED).mean()),
     }
 
@@ -98,7 +98,12 @@ def summarise(returns: np.ndarray) -> dict:
 def bootstrap_interval(values: np.ndarray, resamples: int) -> list[float]:
     """95% interval of the mean of `values`, float (n,), by bootstrap: [low, high]."""
     means = np.random.default_rng(0).choice(values, (resamples, len(values))).mean(axis=1)
-    return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
+    return middle_95(means)
+
+
+def middle_95(samples: np.ndarray) -> list[float]:
+    """Between which two values the middle 95% of the samples, float (n,), lie: [low, high]."""
+    return [float(bound) for bound in np.percentile(samples, [2.5, 97.5])]
 
 
 def describe(result: dict) -> str:

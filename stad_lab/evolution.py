@@ -30,7 +30,7 @@ from stad_lab.agent import (
 )
 from stad_lab.checkpoints import load_json, locked, save_json
 from stad_lab.mdn_rnn import check_partner
-from stad_lab.parallel import refuse_in_starting_worker, return_freed_memory, run_tasks, work_alone, worker_processes
+from stad_lab.parallel import refuse_in_starting_worker, return_freed_memory, run_in_order, work_alone, worker_processes
 from stad_lab.rollouts import track_seeds
 from stad_lab.search_space import SearchSpace, search_space
 from stad_lab.settings import Settings, check_same_run
@@ -353,9 +353,7 @@ def drive_parallel(
     size = min(settings.cars, math.ceil(len(tracks) / 2))
     groups = [slice(start, start + size) for start in range(0, len(tracks), size)]
     tasks = [(source, variant, parameters[group], tracks[group], True, settings) for group in groups]
-    found = dict(run_tasks(executor, drive_group, tasks))
-    returns, lengths = (np.concatenate(part) for part in zip(*(found[n] for n in range(len(tasks))), strict=True))
-    return returns, lengths
+    return tuple(np.concatenate(part) for part in zip(*run_in_order(executor, drive_group, tasks), strict=True))
 
 
 def drive_group(

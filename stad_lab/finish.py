@@ -12,15 +12,13 @@ a new track in a generation of this number, it is the first of the new ones here
 from concurrent.futures import Executor
 from pathlib import Path
 
-import torch
-
 from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.autoencoder import check_variant
-from stad_lab.checkpoints import copy_file, load_json, locked, save_tensors
+from stad_lab.checkpoints import copy_file, load_json, locked
 from stad_lab.evolution import CONTROLLER, evolve
 from stad_lab.parallel import refuse_in_starting_worker
 from stad_lab.pipeline import EARLIER, open_record, read_finished, run_stages, set_options
-from stad_lab.search_space import COMPONENTS, START, load_directions, load_start
+from stad_lab.search_space import COMPONENTS, START, load_directions, load_start, save_start
 from stad_lab.settings import Settings
 
 FINISH = {  # what it changes in the settings of the run that it goes on from
@@ -114,6 +112,5 @@ def begin_finish(variant: str, earlier: Path, folder: Path) -> bool:
     if path.exists():
         load_start(path, world_model)
         return False
-    start = {"parameters": torch.from_numpy(load_controller(earlier / CONTROLLER, variant)[0])}
-    save_tensors(path, start, part="start", variant=variant, **world_model.identities)
+    save_start(path, load_controller(earlier / CONTROLLER, variant)[0], variant, world_model)
     return True

@@ -197,16 +197,14 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     v_path = path.with_name("autoencoder.safetensors")
     autoencoder, v_facts = load_autoencoder(v_path, variant)
     check_facts(v_path, v_facts, settings)
+    check_seen(v_path, v_facts["rollouts"], rollouts_folder)
     if path.exists():
         facts = load_mdn_rnn(path, variant)[1]
         check_facts(path, facts, settings)
         check_partner(path, facts, autoencoder=v_facts["identity"])
-        check_seen(path, v_facts["rollouts"], rollouts_folder)
         checkpoint_of(path).unlink(missing_ok=True)  # of a process that was killed before it did
         return False
     rollouts = Rollouts(rollouts_folder)
-    if v_facts["rollouts"] != rollouts.identity:
-        raise ValueError(f"{v_path} was trained on other rollouts than those in {rollouts_folder}: give its own ones")
     torch.manual_seed(settings.seed)
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)
@@ -282,19 +280,15 @@ def check_partner(path: Path, facts: dict, **identities: str) -> None:
             raise ValueError(f"{path} was made with another {part} than the one beside it: give V, M and C of one run")
 
 
-def load_mdn_rnn(path: Path, variant: str | None = None, latent_size: int | None = None) -> tuple[MDNRNN, dict]:
+def load_mdn_rnn(path: Path, variant: str | None = None) -> tuple[MDNRNN, dict]:
     """Read M: (the MDN-RNN in evaluation mode, the facts it was saved with, among them its history).
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: damaged, not M, or for a V of another variant or latent size.
+        ValueError: damaged, not M, or for a V of another variant.
     """
     tensors, facts = load_tensors(path, REMEDY)
     check_part(path, facts, "mdn_rnn", variant)
-    if latent_size not in (None, facts["latent_size"]):
-        raise ValueError(
-            f"{path} was trained for latent_size {facts['latent_size']}, V has {latent_size}: use M and V of one run"
-        )
     mdn_rnn = MDNRNN(facts["latent_size"], facts["hidden_size"], facts["mixtures"])
     load_into(mdn_rnn, tensors, path)
     return mdn_rnn.eval().requires_grad_(False), facts

@@ -7,6 +7,7 @@ stuck worker is done again: what a task returns depends on its arguments alone, 
 import ctypes
 import functools
 import multiprocessing
+import operator
 import os
 import platform
 import signal
@@ -21,6 +22,7 @@ from pathlib import Path
 
 import cv2
 import torch
+from tqdm.auto import tqdm
 
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # from glibc's malloc.h
 PRELOADED = ["stad_lab.pipeline"]  # what a worker imports: 2 to 4 seconds, of which PyTorch takes most
@@ -194,6 +196,12 @@ def run_tasks(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def run_in_order(executor: Executor, function: Callable, tasks: list[tuple], label: str | None = None) -> list:
+    """What every task returned, in the order of the tasks; with a progress bar if it has a label. As `run_tasks`."""
+    finished = tqdm(run_tasks(executor, function, tasks), label, len(tasks), unit="episode", disable=label is None)
+    return [result for _, result in sorted(finished, key=operator.itemgetter(0))]
 
 
 def refuse_in_starting_worker() -> None:

@@ -121,7 +121,7 @@ def run_stages(
     """Run the wanted stages in order and keep the record of them; False if there was nothing to do."""
     worked = False
     for stage in wanted:
-        begin, did = time.perf_counter(), True  # an interrupted stage has worked too
+        begin, did, pool = time.perf_counter(), True, None  # an interrupted stage has worked too
         try:
             with worker_processes(record["settings"]["processes"], executor) as pool:
                 did = stages[stage](pool)
@@ -322,7 +322,8 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     """Copy what a run has trained into `stad_lab/pretrained/`: records as they are, V and M in half precision.
 
     Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run. A second
-    round, or a finish, goes into a folder `second_round` of its own; returns the new folder.
+    round, or a finish, goes into a folder `second_round` of its own; returns the new folder. What an agent that was
+    shipped before has there, and this run has not, is removed.
 
     Raises:
         FileNotFoundError: the run has no V.
@@ -331,13 +332,15 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     folder = Path(folder)
     load_autoencoder(folder / WEIGHTS[0], variant)
     target = target / "second_round" / variant if (folder / START).exists() else target / variant
+    read = {name: load_tensors(folder / name) for name in WEIGHTS if (folder / name).exists()}  # all, before any goes
     target.mkdir(parents=True, exist_ok=True)
-    for name in WEIGHTS:
-        if (folder / name).exists():
-            tensors, facts = load_tensors(folder / name)
-            small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
-            save_tensors(target / name, small, **facts | {"variant": variant})
+    for name, (tensors, facts) in read.items():
+        small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
+        save_tensors(target / name, small, **facts)
     for name in ("record.json", LOG):
         if (folder / name).exists():
             copy_file(folder / name, target)
+    for name in (*WEIGHTS, LOG):
+        if not (folder / name).exists():
+            (target / name).unlink(missing_ok=True)
     return target

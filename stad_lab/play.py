@@ -214,6 +214,5 @@ class Session:
 
     def _look(self) -> None:
         """Show the agent the present observation, and keep M's memory from before it."""
-        size = self.agent.mdn_rnn.hidden_size
-        self.before = self.agent.state or (torch.zeros(1, 1, size), torch.zeros(1, 1, size))
+        self.before = self.agent.state
         self.proposed = self.agent.act(self.observation)

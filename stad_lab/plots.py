@@ -9,12 +9,14 @@ import itertools
 from collections.abc import Iterable
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from PIL import Image, ImageDraw, ImageFont
 
 from stad_lab.drives import MOTION, Drive, Inside
+from stad_lab.evaluation import SOLVED
 
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
@@ -425,7 +427,7 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
         axis.plot(
             *zip(*validation.items(), strict=True), "o--", color="black", ms=4, label="CMA mean, validation tracks"
         )
-    axis.axhline(900, color="grey", lw=0.8, ls=":")
+    axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
     axis.set(
         xlabel="generation", ylabel="fitness: mean return over the tracks", ylim=(min(-60, curves.min() - 20), 1000)
     )
@@ -454,7 +456,7 @@ def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figu
             generation = np.arange(smooth.shape[1]) + (width + 1) / 2
             axis.plot(generation, smooth.mean(axis=0), dash, color=color, lw=1.6, label=label)
             axis.fill_between(generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.2, lw=0)
-        axis.axhline(900, color="grey", lw=0.8, ls=":")
+        axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
         axis.set_title(f"{name} agent of a generation", fontsize=10)
         axis.set_xlabel("generation")
     window = min([window, *(curves.shape[2] for curves in runs.values())])
@@ -481,7 +483,7 @@ def plot_episodes(
             axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8, label=name if number == 0 else None)
     for (name, points), marker in zip(published.items(), MARKERS, strict=False):
         axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
-    axis.axhline(900, color="grey", lw=0.8, ls=":")
+    axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
     axis.set(xscale="log", xlabel="episodes driven in all (logarithmic)", ylabel="score", ylim=(None, 960))
     # Below the axis: inside it, many names would hide the points.
     figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
@@ -499,7 +501,7 @@ def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
         axis.scatter(values, row + rng.uniform(-0.22, 0.22, len(values)), s=12, color=color, alpha=0.6)
         axis.plot([values.mean()] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
         axis.text(1.01, row, f"mean {values.mean():.0f}", transform=axis.get_yaxis_transform(), va="center", fontsize=9)
-    axis.axvline(900, color="grey", lw=0.8, ls=":")
+    axis.axvline(SOLVED, color="grey", lw=0.8, ls=":")
     axis.set(
         xlabel="return of an episode", yticks=range(len(returns)), yticklabels=list(returns), ylim=(len(returns), -1)
     )
@@ -511,8 +513,6 @@ def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
 
 def difference_colors(difference: np.ndarray, limit: float = 0.15) -> np.ndarray:
     """A difference image, float (..., 3) in [-1, 1], as uint8 colours of the diverging map: for moving pictures."""
-    from matplotlib import colormaps
-
     shade = np.clip(difference.mean(axis=-1) / (2 * limit) + 0.5, 0, 1)
     return (colormaps[DIFFERENCE_MAP](shade)[..., :3] * 255).round().astype(np.uint8)
 

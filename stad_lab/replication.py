@@ -20,7 +20,6 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from stad_lab.autoencoder import AutoEncoder
 from stad_lab.benchmark import save_pair, train_m, train_v
@@ -31,7 +30,7 @@ from stad_lab.evaluation import SOLVED, evaluate, report
 from stad_lab.evolution import CONTROLLER, LOG, drive_generation
 from stad_lab.finish import finish
 from stad_lab.mdn_rnn import MDNRNN
-from stad_lab.parallel import run_tasks, worker_processes
+from stad_lab.parallel import run_in_order, worker_processes
 from stad_lab.pipeline import provenance, train
 from stad_lab.rollouts import RandomDriver, collect_rollouts
 from stad_lab.rows import FLOORS, ROWS, Row, find_row
@@ -61,7 +60,7 @@ def replicate(
         ValueError: an unknown row or seed, or a folder with something else in it.
         OSError, TaskError, FloatingPointError: as `train` and `evaluate`.
     """
-    if name in FLOORS:
+    if name in FLOORS and not seeds:
         return drive_floor(name, Path(folder) / name / "seed0", executor)
     row, folder = find_row(name, seeds), Path(folder)
     folders = {seed: folder / name / f"seed{seed}" for seed in row.seeds}
@@ -84,10 +83,9 @@ def drive_floor(name: str, folder: Path, executor: Executor | None) -> dict:
         folder.mkdir(parents=True, exist_ok=True)
         begin, tracks = time.perf_counter(), list(range(TRACKS))
         with worker_processes(Settings().processes, executor) as executor:
-            tasks = [(name, track) for track in tracks]
-            found = dict(tqdm(run_tasks(executor, drive_blindly, tasks), name, TRACKS, unit="episode"))
-        returns, frames = (np.array(part) for part in zip(*(found[track] for track in tracks), strict=True))
-        told = {"variant": name, "renderer": "none: it does not look"} | report(tracks, returns, frames)
+            driven = run_in_order(executor, drive_blindly, [(name, track) for track in tracks], name)
+        returns, lengths = (np.array(part) for part in zip(*driven, strict=True))
+        told = {"variant": name, "renderer": "none: it does not look"} | report(tracks, returns, lengths)
         record = {"variant": name, "made_with": provenance(f"python -m stad_lab replicate --row {name} --out ...")}
         save_json(folder / "record.json", record | {"budget": {}})
         save_json(folder / "evaluation.json", told | {"seconds": time.perf_counter() - begin})
@@ -158,16 +156,19 @@ def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
         save_json(path, evaluate(row.variant, folder, TRACKS, executor=executor))
 
 
-def keep(name: str, folder: str | Path, target: Path = RECORDS) -> list[Path]:
+def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[int] | None = None) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
     With them go the records and the losses of the first round and of the world, if the row has its own. Seeds that are
     made elsewhere, in a folder without seed 0, may have V and M from another training by the same settings. If so, the
     records of that one go to `first_of_seed1` and `world_of_seed1`, by the first of these seeds; if not, they are there
     already.
+
+    Args:
+        seeds: as of `replicate`.
     """
     kept = []
-    for seed in (0,) if name in FLOORS else find_row(name).seeds:
+    for seed in (0,) if name in FLOORS and not seeds else find_row(name, seeds).seeds:
         source = Path(folder) / name / f"seed{seed}"
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
@@ -203,7 +204,7 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
 
     An agent's episode is taken to have as many frames as it may have at most, so the searches may be quicker.
     """
-    if name in FLOORS:
+    if name in FLOORS and not seeds:
         return {"evaluations": TRACKS * 1000 / (Settings().processes * blind_speed(name))}
     row = find_row(name, seeds)
     if row.base:

@@ -16,6 +16,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import WorldModel, read_world_model
+from stad_lab.autoencoder import check_part
 from stad_lab.checkpoints import load_tensors, save_tensors
 from stad_lab.controller import ACTION_SIZE, check_parameters, initial_parameters, parameter_count, seen_columns
 from stad_lab.drives import remember_drive
@@ -68,9 +69,16 @@ def search_space(settings: Settings, world_model: WorldModel, folder: Path) -> S
     return SearchSpace(start[seen], np.zeros(len(start)), np.eye(len(start))[seen])
 
 
+def save_start(path: Path, parameters: np.ndarray, variant: str, world_model: WorldModel) -> None:
+    """Write the C, float64 (parameters,), that a second round or a finish starts from with its V and M."""
+    tensors = {"parameters": torch.from_numpy(parameters)}
+    save_tensors(path, tensors, part="start", variant=variant, **world_model.identities)
+
+
 def load_start(path: Path, world_model: WorldModel) -> np.ndarray:
     """The C that a second round or a finish starts from, float64 (parameters,). Raises as `search_space`."""
     tensors, facts = load_tensors(path, MAKE_AGAIN)
+    check_part(path, facts, "start", None)
     check_partner(path, facts, **world_model.identities)
     parameters = tensors["parameters"].numpy()
     check_parameters(parameters, parameter_count(*sizes(world_model)), path)
@@ -87,9 +95,9 @@ def find_components(variant: str, settings: Settings, rollouts_folder: Path, fol
         ValueError, FileNotFoundError: V, M, the rollouts, or the components that are there already are damaged,
             missing, or of another run.
     """
-    path, world_model = Path(folder) / COMPONENTS, read_world_model(Path(folder), variant)
     if not settings.components:
         return False
+    path, world_model = Path(folder) / COMPONENTS, read_world_model(Path(folder), variant)
     if path.exists():
         load_directions(path, world_model)
         return False
@@ -107,7 +115,7 @@ def find_components(variant: str, settings: Settings, rollouts_folder: Path, fol
 def features(world_model: WorldModel, frames: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """What C sees in an episode: z and the h before it, float32 (T, latent_size + hidden_size)."""
     latents = encode_frames(world_model.autoencoder, frames, world_model.stride)[0]
-    return np.concatenate([latents, remember_drive(world_model.mdn_rnn, latents, actions)[0]], axis=1)
+    return np.concatenate([latents, remember_drive(world_model.mdn_rnn, latents, actions)], axis=1)
 
 
 def principal_components(seen: Iterable[np.ndarray], columns: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -143,6 +151,7 @@ def load_directions(path: Path, world_model: WorldModel) -> np.ndarray:
     Raises as `search_space`.
     """
     tensors, facts = load_tensors(path, MAKE_AGAIN)
+    check_part(path, facts, "components", None)
     check_partner(path, facts, **world_model.identities)
     middle, components = tensors["middle"].numpy(), tensors["components"].numpy()
     outputs = np.eye(ACTION_SIZE)

@@ -15,13 +15,13 @@ import torch
 
 from stad_lab.agent import Agent, WorldModel, load_agent, load_controller, read_world_model
 from stad_lab.car_racing import make_env
-from stad_lab.checkpoints import checksum, save_tensors
+from stad_lab.checkpoints import checksum
 from stad_lab.controller import ACTION_SIZE, seen_columns, unpack
 from stad_lab.evolution import CONTROLLER, hand_out, make_agent
 from stad_lab.frames import to_frame
 from stad_lab.parallel import work_alone, worker_processes
 from stad_lab.rollouts import AGENT_FIELDS, COLLECT_FIELDS, Rollouts, collect, drive_randomly, track_seeds
-from stad_lab.search_space import START, features, load_start, sizes
+from stad_lab.search_space import START, features, load_start, save_start, sizes
 from stad_lab.settings import Settings
 
 NOISE = 0.1  # of a frame's steering and gas; it wanders like the random driver's hand, so that many moments differ
@@ -141,7 +141,7 @@ def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder:
             seen.append(features(new, frames, actions))
     columns = seen_columns(settings.features, *sizes(new))
     start = fit_controller(np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT), columns)
-    save_tensors(path, {"parameters": torch.from_numpy(start)}, part="start", variant=variant, **new.identities)
+    save_start(path, start, variant, new)
     return True
 
 

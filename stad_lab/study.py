@@ -69,7 +69,7 @@ STUDY_COMMAND = "python -m stad_lab study --settings {} --part {} --out ..."
 RECORD = Path(__file__).parent / "records" / "study.json"  # the study that we report
 AWAKE = 30  # frames that M sees before a dream
 HORIZON = [1, 2, 3, 5, 7, 10, 14, 20, 30, 40, 50, 60, 70, 80, 90, 100]  # dreamed steps at which it is judged
-RESAMPLES = 1000  # of the drives, for an interval
+DRIVE_RESAMPLES = 1000  # of the drives, for an interval
 DREAMERS = 60  # drives in which M falls asleep
 
 
@@ -189,7 +189,7 @@ def probe_drives(
     latents = [encode_drive(autoencoder, drive, stride, crop_bar)[0] for drive in drives]
     features = {"z": np.concatenate(latents)}
     for name, mdn_rnn in memories.items():
-        hidden = [remember_drive(mdn_rnn, z, drive.actions)[0] for z, drive in zip(latents, drives, strict=True)]
+        hidden = [remember_drive(mdn_rnn, z, drive.actions) for z, drive in zip(latents, drives, strict=True)]
         features[name] = np.concatenate([features["z"], np.concatenate(hidden)], axis=1)
     motion = np.concatenate([drive.motion for drive in drives])
     number = np.repeat(np.arange(len(drives)), [len(drive) for drive in drives])
@@ -292,8 +292,8 @@ def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
     return {
         name: {
             "nats": float(found.mean()),
-            "interval": bootstrap_interval(found, RESAMPLES),
-            "more_than_M": bootstrap_interval(found - means["M"], RESAMPLES),
+            "interval": bootstrap_interval(found, DRIVE_RESAMPLES),
+            "more_than_M": bootstrap_interval(found - means["M"], DRIVE_RESAMPLES),
         }
         for name, found in means.items()
     }

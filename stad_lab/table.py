@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stad_lab.checkpoints import load_json
-from stad_lab.evaluation import SOLVED
+from stad_lab.evaluation import RESAMPLES, SOLVED, middle_95
 from stad_lab.evaluation import summarise as summarise_episodes
 from stad_lab.evolution import LOG
 from stad_lab.pipeline import total_budget
@@ -30,7 +30,6 @@ OTHERS = {  # the rest of that table
 }
 PAPER_BEST = {"best agent": 929.82, "best generation": 911.73}  # the highest points of its figures
 TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
-RESAMPLES = 10_000
 
 
 def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
@@ -131,7 +130,7 @@ def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     interval may be too narrow (notebook 05, step 7). Agarwal et al., 2021, argue for bootstraps where runs are few.
     """
     means = resampled_means(returns, *draw_tracks(returns, resamples))
-    return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
+    return middle_95(means)
 
 
 def bootstrap_gain(before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
@@ -142,7 +141,7 @@ def bootstrap_gain(before: np.ndarray, after: np.ndarray, resamples: int = RESAM
     """
     rng, tracks = draw_tracks(before, resamples)
     gains = resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks)
-    return [float(bound) for bound in np.percentile(gains, [2.5, 97.5])]
+    return middle_95(gains)
 
 
 def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generator, np.ndarray]:

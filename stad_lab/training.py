@@ -106,7 +106,7 @@ def fit(
 def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[int, tuple]]:
     """Every step with its batch, which a thread has read while the step before was trained."""
     with ThreadPoolExecutor(1) as reader:
-        following = reader.submit(batch, steps.start)
+        following = reader.submit(batch, steps.start) if steps else None
         for step in steps:
             present, following = following, reader.submit(batch, step + 1) if step + 1 < steps.stop else None
             yield step, present.result()

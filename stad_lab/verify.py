@@ -4,7 +4,6 @@ The same seed, settings, versions, processor and number of threads give equal bi
 episode can be driven again to the same return, and a log of CMA-ES can be told again to the same mean.
 """
 
-import functools
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
@@ -26,9 +25,9 @@ from stad_lab.evolution import (
     validate,
 )
 from stad_lab.mdn_rnn import load_mdn_rnn
-from stad_lab.parallel import TaskError, run_tasks, worker_processes
+from stad_lab.parallel import TaskError, run_in_order, worker_processes
 from stad_lab.pipeline import EARLIER, MACHINE, PACKAGES, provenance, starts
-from stad_lab.rollouts import Rollouts
+from stad_lab.rollouts import Rollouts, check_seen
 from stad_lab.search_space import search_space
 from stad_lab.settings import Settings
 
@@ -55,11 +54,10 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
     if "settings" not in record:
         raise ValueError(f"{folder} is of {record['variant']}, which has no V, M and C: there is nothing to verify")
     variant, settings = record["variant"], Settings.from_dict(record["settings"])
-    read_rollouts = functools.cache(Rollouts)  # it checks every block, and a dataset may have 12 GB: once is enough
     checks: dict[str, Callable[[], str]] = {
         "record": lambda: f"ok: {variant}, {settings.name} settings",
-        "rollouts": lambda: verify_rollouts(folder / "rollouts", read_rollouts),
-        "V": lambda: verify_autoencoder(folder, variant, settings, read_rollouts),
+        "rollouts": lambda: verify_rollouts(folder / "rollouts"),
+        "V": lambda: verify_autoencoder(folder, variant, settings),
         "M": lambda: verify_mdn_rnn(folder, variant, settings),
         "log of CMA-ES": lambda: verify_log(folder, variant, settings),
         "C": lambda: verify_controller(folder, variant, settings),
@@ -94,25 +92,22 @@ def other_machine(made_with: dict) -> str:
     )
 
 
-def verify_rollouts(folder: Path, read_rollouts: Callable[[Path], Rollouts]) -> str:
+def verify_rollouts(folder: Path) -> str:
     """Check every block against the manifest."""
     if not folder.is_dir():
         return f"none: {NOT_HERE}"
-    rollouts = read_rollouts(folder)
+    rollouts = Rollouts(folder)
     return f"ok: {len(rollouts.frames)} episodes, {len(rollouts)} frames"
 
 
-def verify_autoencoder(
-    folder: Path, variant: str, settings: Settings, read_rollouts: Callable[[Path], Rollouts]
-) -> str:
+def verify_autoencoder(folder: Path, variant: str, settings: Settings) -> str:
     """Check V, its settings, and that it has seen these rollouts."""
     path = folder / "autoencoder.safetensors"
     if not path.exists():
         return f"none: {NOT_HERE}"
     _, facts = load_autoencoder(path, variant)
     check_facts(path, facts, settings)
-    if (folder / "rollouts").is_dir() and facts["rollouts"] not in (None, read_rollouts(folder / "rollouts").identity):
-        raise ValueError(f"{path} was trained on other rollouts than those in {folder / 'rollouts'}")
+    check_seen(path, facts["rollouts"], folder / "rollouts")
     return "ok"
 
 
@@ -142,14 +137,14 @@ def verify_log(folder: Path, variant: str, settings: Settings) -> str:
 
 
 def verify_controller(folder: Path, variant: str, settings: Settings) -> str:
-    """Check that C is the mean that the log calls the best."""
+    """Check that C is the one that the log calls the best."""
     if not (folder / CONTROLLER).exists():
         return f"none: {NOT_HERE}"
     log = read_log(variant, settings, folder, read_world_model(folder, variant))
     kept, best = kept_generation(variant, folder, log), log["best"]
     if best is None or kept != best["generation"]:
-        raise ValueError(f"{folder / CONTROLLER} is the mean of generation {kept}, the log calls {best} the best")
-    return f"ok: mean of generation {kept}"
+        raise ValueError(f"{folder / CONTROLLER} is the C of generation {kept}, the log calls {best} the best")
+    return f"ok: C of generation {kept}"
 
 
 def verify_evaluations(folder: Path) -> str:
@@ -175,8 +170,7 @@ def drive_again(folder: Path, variant: str, settings: Settings, executor: Execut
             chosen = [episodes[n] for n in np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)]
             recorded = [episode["return"] for episode in chosen]
             tasks = [(source, variant, parameters, [episode["track"]], fast, None) for episode in chosen]
-            found = dict(run_tasks(executor, drive_group, tasks))
-            driven = [float(found[n][0][0]) for n in range(len(tasks))]
+            driven = [float(returns[0]) for returns, _ in run_in_order(executor, drive_group, tasks)]
         else:  # all the tracks, because last bits depend on the cars that drive in step
             log = read_log(variant, settings, folder, read_world_model(folder, variant))
             look = log["generations"][kept_generation(variant, folder, log) - 1]

@@ -246,7 +246,7 @@ def test_a_nan_action_never_reaches_the_car(observations):
 def test_parameters_of_another_size_are_refused():
     agent = make_agent()
     with pytest.raises(ValueError, match=r"shape \(867,\), expected \(147,\).*another size"):
-        Agent(agent.autoencoder, agent.mdn_rnn, np.zeros(867))
+        Agent(agent.autoencoder, agent.mdn_rnn, np.zeros(867), agent.stride, agent.crop_bar)
 
 
 def test_an_unknown_variant_is_refused_with_the_choices(quick_run):
@@ -315,3 +315,16 @@ def test_a_shipped_agent_acts_almost_like_the_run_it_comes_from(quick_run, agent
     assert np.allclose(act_along(shipped, observations[:12]), act_along(agent, observations[:12]), atol=1e-3)
     sizes = [(folder / "autoencoder.safetensors").stat().st_size for folder in (tmp_path / "input_output", quick_run)]
     assert sizes[0] < 0.6 * sizes[1]
+
+
+def test_a_damaged_run_is_not_shipped_and_one_without_c_leaves_none_of_before(quick_run, tmp_path):
+    run, target = shutil.copytree(quick_run, tmp_path / "run"), ship("input_output", quick_run, tmp_path / "shipped")
+    before = {file.name: file.read_bytes() for file in target.iterdir()}
+    (run / "controller.safetensors").write_bytes(b"cut short")
+    with pytest.raises(ValueError, match=r"controller\.safetensors is damaged"):
+        ship("input_output", run, tmp_path / "shipped")
+    assert {file.name: file.read_bytes() for file in target.iterdir()} == before
+    (run / "controller.safetensors").unlink()
+    (run / "evolution.json").unlink()
+    ship("input_output", run, tmp_path / "shipped")
+    assert {file.name for file in target.iterdir()} == {"autoencoder.safetensors", "mdn_rnn.safetensors", "record.json"}

@@ -149,7 +149,7 @@ explore_latents(agent.autoencoder, np.zeros(32, np.float32))
 """,
     """
 drive = record_drive(agent, track=4, frames=12)
-view_drive(drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride))
+view_drive(drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar))
 """,
 )
 

@@ -282,7 +282,7 @@ def test_weights_of_another_variant_end_in_one_clear_line(run, capsys):
 def test_v_of_another_size_ends_in_one_clear_line(run, capsys):
     save_autoencoder(run / "autoencoder.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
     error = the_error(capsys, evaluate_quickly(run))
-    assert "mdn_rnn.safetensors was trained for latent_size 32, V has 16: use M and V of one run" in error
+    assert "mdn_rnn.safetensors was made with another autoencoder than the one beside it: give V, M and C" in error
 
 
 def test_c_of_another_size_ends_in_one_clear_line(run, capsys):

@@ -69,9 +69,9 @@ def test_the_road_is_in_sight_near_it_and_along_it_only():
 
 def test_a_random_drive_is_that_of_the_rollouts_on_a_track_of_its_own(random_drive):
     frames, actions, _ = drive_randomly(SETTINGS, 0)
-    assert len(random_drive) == len(random_drive.frames()) == len(random_drive.motion) == len(random_drive.rewards)
+    assert len(random_drive) == len(random_drive.frames(True)) == len(random_drive.motion) == len(random_drive.rewards)
     assert np.array_equal(random_drive.actions[: len(actions)], actions[: len(random_drive)])
-    assert not np.array_equal(random_drive.frames()[0], frames[0])  # another track
+    assert not np.array_equal(random_drive.frames(True)[0], frames[0])  # another track
     again = record_random_drive(SETTINGS, 0)
     assert np.array_equal(again.observations, random_drive.observations)
 
@@ -99,7 +99,7 @@ def test_an_agent_s_drive_is_recorded_as_it_was_driven(agent):
 
 def test_the_inside_of_a_drive_is_what_the_agent_saw(agent):
     drive = record_drive(agent, track=4, frames=12)
-    inside = look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride)
+    inside = look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
     agent.reset()
     for t in range(12):
         agent.act(drive.observations[t])
@@ -112,10 +112,10 @@ def test_the_inside_of_a_drive_is_what_the_agent_saw(agent):
 
 
 def test_m_s_memory_before_a_frame_does_not_know_it(agent, random_drive):
-    mu, _ = encode_drive(agent.autoencoder, random_drive, agent.stride)
-    hidden, _ = remember_drive(agent.mdn_rnn, mu, random_drive.actions)
+    mu, _ = encode_drive(agent.autoencoder, random_drive, agent.stride, agent.crop_bar)
+    hidden = remember_drive(agent.mdn_rnn, mu, random_drive.actions)
     changed = mu.copy()
     changed[20:] += 1
-    after, _ = remember_drive(agent.mdn_rnn, changed, random_drive.actions)
+    after = remember_drive(agent.mdn_rnn, changed, random_drive.actions)
     assert np.array_equal(hidden[:21], after[:21]) and not np.allclose(hidden[21], after[21])
     assert torch.count_nonzero(torch.from_numpy(hidden[0])) == 0

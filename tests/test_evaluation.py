@@ -74,9 +74,9 @@ def test_a_result_names_the_controller_that_drove_if_a_search_finds_a_better_one
 
     def find_a_better_one(*given):
         (run / "controller.safetensors").write_bytes(b"another")
-        return [(0, (np.array([1.0]), np.array([7])))]
+        return [(np.array([1.0]), np.array([7]))]
 
-    monkeypatch.setattr("stad_lab.evaluation.run_tasks", find_a_better_one)
+    monkeypatch.setattr("stad_lab.evaluation.run_in_order", find_a_better_one)
     assert evaluate("input_output", run, episodes=1)["controller_sha256"] == checksum(drove)
 
 

@@ -50,7 +50,7 @@ def test_the_memory_is_told_what_the_hand_did(session):
         drive(session, ("gas", 1))
     assert session.by_hand().all()
     done = np.concatenate([session.drive().actions, np.zeros((1, 3), np.float32)])
-    hidden, _ = remember_drive(session.agent.mdn_rnn, np.array([*seen, session.agent.latents[0]]), done)
+    hidden = remember_drive(session.agent.mdn_rnn, np.array([*seen, session.agent.latents[0]]), done)
     assert np.allclose(session.before[0][0, 0], hidden[-1], atol=1e-5)
 
 

@@ -37,7 +37,7 @@ def test_v_and_m_of_every_variant_are_shipped_with_their_record(variant):
         settings.width,
     )
     assert facts["history"][-1]["step"] == settings.v_steps
-    _, m_facts = load_mdn_rnn(PRETRAINED / variant / "mdn_rnn.safetensors", variant, settings.latent_size)
+    _, m_facts = load_mdn_rnn(PRETRAINED / variant / "mdn_rnn.safetensors", variant)
     assert m_facts["history"][-1]["step"] == settings.m_steps
     assert record["made_with"]["commit"] and not record["made_with"]["uncommitted_changes"]
 

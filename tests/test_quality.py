@@ -30,7 +30,7 @@ from stad_lab.settings import Settings
 @pytest.fixture(scope="module")
 def film():
     """Frames of one drive."""
-    return record_random_drive(Settings.preset("quick", seed=3, random_starts=1.0), 0).frames()
+    return record_random_drive(Settings.preset("quick", seed=3, random_starts=1.0), 0).frames(True)
 
 
 def latents_and_actions(drives=30, length=20, size=4, seed=0):

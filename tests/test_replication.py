@@ -305,6 +305,9 @@ def test_a_driver_that_does_not_look_is_a_row_like_any_other(tmp_path, monkeypat
         assert row["episodes"] == 0 and keep(name, tmp_path, tmp_path / "kept")
         assert replicate(name, tmp_path) == row and "evaluations" in describe_forecast(name, forecast(name))
     assert found["random_driver"]["mean"] != found["gentle_driver"]["mean"]
+    for ask in (replicate, keep):
+        with pytest.raises(ValueError, match="row 'random_driver' is no search and has no seeds"):
+            ask("random_driver", tmp_path, seeds=[0])
 
 
 def test_lost_points_tell_slow_laps_from_waiting_for_the_end_after_a_missed_tile(tmp_path):

@@ -100,6 +100,17 @@ def test_components_are_found_once_and_belong_to_their_v_and_m(searched, quick_r
     assert (other / "components.safetensors").read_bytes() == (searched / "components.safetensors").read_bytes()
 
 
+def test_a_file_under_the_name_of_another_part_is_refused(searched, tmp_path):
+    folder, world_model = shutil.copytree(searched, tmp_path / "run"), read_world_model(searched, VARIANT)
+    shutil.copy(folder / "components.safetensors", folder / "start.safetensors")
+    with pytest.raises(ValueError, match="holds 'components': expected 'start'"):
+        search_space(SETTINGS, world_model, folder)
+    (folder / "start.safetensors").unlink()
+    shutil.copy(folder / "mdn_rnn.safetensors", folder / "components.safetensors")
+    with pytest.raises(ValueError, match="holds 'mdn_rnn': expected 'components'"):
+        search_space(SETTINGS, world_model, folder)
+
+
 def test_a_search_does_not_go_on_along_other_components(searched, quick_run, tmp_path):
     folder, other = (shutil.copytree(searched, tmp_path / name) for name in ("run", "other"))
     (other / "components.safetensors").unlink()

@@ -24,7 +24,7 @@ def find(widget, kind):
 def inside(agent):
     """A short drive and what V and M make of it."""
     drive = record_drive(agent, track=4, frames=9)
-    return drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride)
+    return drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
 
 
 def test_the_latent_explorer_has_a_slider_for_each_latent_and_redraws_in_less_than_100_ms(agent):
