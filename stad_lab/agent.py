@@ -132,6 +132,9 @@ def drive(
 
     Returns:
         The returns, float64 (tracks,), and the lengths in frames, int (tracks,).
+
+    Raises:
+        ValueError: as `Agent.act_batch`.
     """
     unseen = {"bar": False} if fast and agent.crop_bar else {}  # what V crops need not be drawn
     envs = [make_env(fast, **unseen) for _ in tracks]

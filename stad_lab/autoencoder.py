@@ -176,6 +176,11 @@ def to_array(pictures: torch.Tensor) -> np.ndarray:
     return pictures.permute(0, 2, 3, 1).numpy()
 
 
+def to_uint8(frames: torch.Tensor) -> np.ndarray:
+    """Frames that V drew, float (batch, 3, 64, 64) in [0, 1] -> uint8 (batch, 64, 64, 3)."""
+    return to_array((frames * 255).round().byte())
+
+
 def autoencoder_losses(
     autoencoder: AutoEncoder, frame: torch.Tensor, difference: torch.Tensor, noise: torch.Tensor, settings: Settings
 ) -> dict[str, torch.Tensor]:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from stad_lab.agent import Agent
-from stad_lab.autoencoder import AutoEncoder
+from stad_lab.autoencoder import AutoEncoder, to_uint8
 from stad_lab.car_racing import MAX_FRAMES
 from stad_lab.controller import control
 from stad_lab.mdn_rnn import ACTION_SIZE, MDNRNN, Mixture, State, check_temperature, sample_mixture
@@ -31,6 +31,9 @@ class DreamEnv(gym.Env):
         temperature: 1 is what M has learned, below 1 is calmer, above 1 is wilder.
         max_frames: length of a dream.
         render_mode: "rgb_array" for pictures from `render()`, or None.
+
+    Raises:
+        ValueError: a temperature that is not above 0, or another render mode.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
@@ -62,6 +65,9 @@ class DreamEnv(gym.Env):
 
         Returns:
             z and {"hidden": h}.
+
+        Raises:
+            ValueError: latents of another shape, or not finite.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -115,11 +121,6 @@ class DreamEnv(gym.Env):
 
     def _info(self) -> dict:
         return {"hidden": self.state[0][0, 0].numpy().copy()}
-
-
-def to_uint8(frames: torch.Tensor) -> np.ndarray:
-    """Frames that V drew, float (batch, 3, 64, 64) in [0, 1] -> uint8 (batch, 64, 64, 3)."""
-    return (frames * 255).round().byte().permute(0, 2, 3, 1).numpy()
 
 
 @torch.no_grad()

@@ -12,9 +12,8 @@ import numpy as np
 import torch
 
 from stad_lab.agent import Agent
-from stad_lab.autoencoder import AutoEncoder, to_array
+from stad_lab.autoencoder import AutoEncoder, to_array, to_uint8
 from stad_lab.car_racing import TRACK_WIDTH, make_env
-from stad_lab.dream import to_uint8
 from stad_lab.frames import episode_differences, to_frame
 from stad_lab.mdn_rnn import MDNRNN, Mixture, encode_frames
 from stad_lab.rollouts import begin_randomly
@@ -117,9 +116,9 @@ def record_random_drive(settings: Settings, index: int) -> Drive:
     return record(env, observation, lambda _: driver.act(), settings.episode_frames)
 
 
-def record_drive(agent: Agent, track: int, frames: int, fast: bool = True) -> Drive:
+def record_drive(agent: Agent, track: int, frames: int) -> Drive:
     """A drive of an agent from the start of a track, at most `frames` long."""
-    env = make_env(fast)
+    env = make_env()
     observation, _ = env.reset(seed=track)
     agent.reset()
     return record(env, observation, agent.act, frames)

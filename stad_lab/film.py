@@ -4,8 +4,7 @@ import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent
-from stad_lab.autoencoder import to_array, to_pictures
-from stad_lab.dream import to_uint8
+from stad_lab.autoencoder import to_array, to_pictures, to_uint8
 from stad_lab.drives import FRAMES_A_SECOND, Drive, Inside, look_inside, record_drive
 from stad_lab.frames import earlier_frames
 from stad_lab.plots import check_kind, difference_colors, moving_figure, moving_picture, plot_moment

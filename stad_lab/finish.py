@@ -17,7 +17,7 @@ from stad_lab.autoencoder import check_variant
 from stad_lab.checkpoints import copy_file, load_json, locked
 from stad_lab.evolution import CONTROLLER, evolve
 from stad_lab.parallel import refuse_in_starting_worker
-from stad_lab.pipeline import EARLIER, open_record, read_finished, run_stages, set_options
+from stad_lab.pipeline import GIVE_A_RUN, open_record, read_finished, run_stages, set_options
 from stad_lab.search_space import COMPONENTS, START, load_directions, load_start, save_start
 from stad_lab.settings import Settings
 
@@ -40,9 +40,9 @@ def finish_settings(earlier: str | Path, **changes) -> Settings:
     Raises:
         ValueError, FileNotFoundError: an unknown field, a value out of range, or no record of a run.
     """
-    record = load_json(Path(earlier) / "record.json", EARLIER)
+    record = load_json(Path(earlier) / "record.json", GIVE_A_RUN)
     if "settings" not in record:
-        raise ValueError(f"{earlier} is of {record['variant']}, which has no C to go on from: {EARLIER}")
+        raise ValueError(f"{earlier} is of {record['variant']}, which has no C to go on from: {GIVE_A_RUN}")
     return Settings.from_dict(record["settings"] | FINISH | changes)
 
 

@@ -217,7 +217,7 @@ def fit_mdn_rnn(
     path: Path,
     mdn_rnn: MDNRNN,
     variant: str,
-    autoencoder: str,
+    v_identity: str,
     encoded: list[np.ndarray],
     actions: list[np.ndarray],
     rollouts: Rollouts,
@@ -225,8 +225,8 @@ def fit_mdn_rnn(
 ) -> None:
     """Train M on encoded episodes (see `encode_rollouts`) and the actions that it is shown, and write it to `path`.
 
-    Training has a fixed length; the rollouts say which episodes are held out, `autoencoder` is the identity of the V
-    that has encoded them. It resumes.
+    Training has a fixed length; the rollouts say which episodes are held out, `v_identity` is that of the V that
+    has encoded them. It resumes.
     """
     device, first_heldout = next(mdn_rnn.parameters()).device, rollouts.episode[rollouts.split()[1][0]]
 
@@ -249,12 +249,12 @@ def fit_mdn_rnn(
         long_episodes(encoded[:first_heldout], settings.m_sequence, "training ")
         long_episodes(encoded[first_heldout:], settings.m_sequence, "held-out ")
     checkpoint = checkpoint_of(path)
-    identity = {"part": "mdn_rnn", "variant": variant, "autoencoder": autoencoder, "rollouts": rollouts.identity}
+    identity = {"part": "mdn_rnn", "variant": variant, "autoencoder": v_identity, "rollouts": rollouts.identity}
     identity |= settings.as_dict()
     steps, rate = settings.m_steps, settings.m_learning_rate
     with locked(path.parent):
         history = fit(mdn_rnn, batch, losses, heldout_losses, steps, rate, checkpoint, "train M", identity)
-        save_mdn_rnn(path, mdn_rnn, variant, settings, history, autoencoder)
+        save_mdn_rnn(path, mdn_rnn, variant, settings, history, v_identity)
         checkpoint.unlink(missing_ok=True)  # there is none after 0 steps
 
 
@@ -264,10 +264,10 @@ def checkpoint_of(path: Path) -> Path:
 
 
 def save_mdn_rnn(
-    path: Path, mdn_rnn: MDNRNN, variant: str, settings: Settings, history: list, autoencoder: str | None = None
+    path: Path, mdn_rnn: MDNRNN, variant: str, settings: Settings, history: list, v_identity: str | None = None
 ) -> None:
     """Write M's weights with what is needed to build it again, and the variant and identity of the V it belongs to."""
-    facts = {"part": "mdn_rnn", "variant": variant, "autoencoder": autoencoder, "history": history}
+    facts = {"part": "mdn_rnn", "variant": variant, "autoencoder": v_identity, "history": history}
     facts |= {name: getattr(mdn_rnn, name) for name in ("latent_size", "hidden_size", "mixtures")}
     facts |= {name: getattr(settings, name) for name in M_SETTINGS}
     save_tensors(path, mdn_rnn.state_dict(), identity=checksum_of_tensors(mdn_rnn.state_dict()), **facts)

@@ -2,11 +2,11 @@
 
 The folder of a run::
 
-    rollouts/                     the random driver's episodes
+    rollouts/                     the random driver's episodes, in a second round the earlier agent's too
     autoencoder.safetensors       V
     mdn_rnn.safetensors           M
     evolution.json                every generation of CMA-ES
-    controller.safetensors        C: the CMA mean that drove the validation tracks best
+    controller.safetensors        C: the average of the last CMA means, when it drove the validation tracks best
     components.safetensors        where C is searched, with `Settings.components`
     start.safetensors             only in a second round or a finish: the earlier run's C, for the V and M here
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
@@ -33,7 +33,7 @@ from stad_lab.checkpoints import copy_file, load_json, load_tensors, locked, sav
 from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory, refuse_in_starting_worker, worker_processes
-from stad_lab.rollouts import COLLECT_FIELDS, collect_rollouts
+from stad_lab.rollouts import COLLECT_SETTINGS, collect_rollouts
 from stad_lab.search_space import COMPONENTS, START, find_components
 from stad_lab.second_round import carry_over, check_earlier_agent, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
@@ -43,7 +43,7 @@ STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
 WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, COMPONENTS, "controller.safetensors")
-EARLIER = "give the folder of a run, as `python -m stad_lab train --out` makes it"
+GIVE_A_RUN = "give the folder of a run, as `python -m stad_lab train --out` makes it"
 
 
 def train(
@@ -149,8 +149,8 @@ def read_finished(earlier: Path) -> dict:
         ValueError: it is not, or a file is damaged.
         FileNotFoundError: there is no run, or no log of a search.
     """
-    record = load_json(earlier / "record.json", EARLIER)
-    log, settings = load_json(earlier / LOG, EARLIER)["generations"], record["settings"]
+    record = load_json(earlier / "record.json", GIVE_A_RUN)
+    log, settings = load_json(earlier / LOG, GIVE_A_RUN)["generations"], record["settings"]
     whole = settings["generations"] * settings["population"]
     if len(log) != settings["generations"] or record.get("budget", {}).get("agents") != whole:
         raise ValueError(
@@ -160,11 +160,11 @@ def read_finished(earlier: Path) -> dict:
     return record
 
 
-def open_record(folder: Path, variant: str, settings: Settings, command: str, earlier: dict | None = None) -> dict:
+def open_record(folder: Path, variant: str, settings: Settings, command: str, before: dict | None = None) -> dict:
     """The record of the run in `folder`, or a new one.
 
     Args:
-        earlier: the record of the run that a second round, or a finish, goes on from; this one's holds it.
+        before: the record of the run that a second round, or a finish, goes on from; this one's holds it.
 
     What it was "made_with" stays that of the first start; a later one by other means adds to "continued_with".
 
@@ -180,15 +180,15 @@ def open_record(folder: Path, variant: str, settings: Settings, command: str, ea
             "made_with": provenance(command),
             "seconds": {},
         }
-        if earlier is not None:
-            record["earlier"] = earlier
+        if before is not None:
+            record["earlier"] = before
         save_json(path, record)
         return record
     record = load_json(path)
     check_same_run(
         path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
     )
-    if what_counts(record.get("earlier")) != what_counts(earlier):
+    if what_counts(record.get("earlier")) != what_counts(before):
         raise ValueError(
             f"{folder} holds a run that does not go on from the one given as it is now: choose another folder, or give"
             " the run that it goes on from"
@@ -312,7 +312,7 @@ def total_budget(record: dict) -> dict:
     total["agents"] = record["budget"].get("agents", 0)
     if "earlier" in record:
         before = total_budget(record["earlier"])
-        again = all(record["settings"][field] == record["earlier"]["settings"][field] for field in COLLECT_FIELDS)
+        again = all(record["settings"][field] == record["earlier"]["settings"][field] for field in COLLECT_SETTINGS)
         made_again = record["budget"]["random"] if again else {}
         total = {unit: count + before[unit] - made_again.get(unit, 0) for unit, count in total.items()}
     return total

@@ -417,16 +417,14 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
 
     Args:
         curves: (3, generations), as `evolution.fitness_curves` makes them.
-        validation: generation -> mean return of the CMA mean on the validation tracks.
+        validation: generation -> mean return of C so far on the validation tracks.
     """
     figure, ((axis,),) = new_figure(7.0, 3.8)
     generation = np.arange(1, curves.shape[1] + 1)
     for values, name, color in zip(curves, ("worst", "average", "best"), (RED, BLUE, GREEN), strict=True):
         axis.plot(generation, values, color=color, lw=1.3, label=f"{name} agent of the generation")
     if validation:
-        axis.plot(
-            *zip(*validation.items(), strict=True), "o--", color="black", ms=4, label="CMA mean, validation tracks"
-        )
+        axis.plot(*zip(*validation.items(), strict=True), "o--", color="black", ms=4, label="C, validation tracks")
     axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
     axis.set(
         xlabel="generation", ylabel="fitness: mean return over the tracks", ylim=(min(-60, curves.min() - 20), 1000)
@@ -511,9 +509,12 @@ def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
     return figure
 
 
-def difference_colors(difference: np.ndarray, limit: float = 0.15) -> np.ndarray:
-    """A difference image, float (..., 3) in [-1, 1], as uint8 colours of the diverging map: for moving pictures."""
-    shade = np.clip(difference.mean(axis=-1) / (2 * limit) + 0.5, 0, 1)
+def difference_colors(difference: np.ndarray) -> np.ndarray:
+    """A difference image, float (..., 3) in [-1, 1], as uint8 colours of the diverging map: for moving pictures.
+
+    Beyond -0.15 and 0.15 the colours no longer change.
+    """
+    shade = np.clip(difference.mean(axis=-1) / 0.3 + 0.5, 0, 1)
     return (colormaps[DIFFERENCE_MAP](shade)[..., :3] * 255).round().astype(np.uint8)
 
 

@@ -30,7 +30,8 @@ def probe(
         "r2" (targets,), "low" and "high" (targets,): its 95% interval.
 
     Raises:
-        ValueError: rows that do not agree in number or are not finite, or fewer than 10 drives.
+        ValueError: rows that do not agree in number or are not finite, a target that never changes, or fewer than 10
+            drives.
     """
     check_rows(features, targets, drives)
     rng = np.random.default_rng(seed)

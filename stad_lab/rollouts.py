@@ -34,8 +34,8 @@ TRACK_RANGES = {
 }
 NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array's shape is short
 FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
-COLLECT_FIELDS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
-AGENT_FIELDS = ("agent_episodes", "max_frames", "patience")  # and if an agent drives for it, too
+COLLECT_SETTINGS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
+AGENT_SETTINGS = ("agent_episodes", "max_frames", "patience")  # and if an agent drives for it, too
 
 
 def track_seeds(use: str, count: int, *seed: int) -> list[int]:
@@ -139,7 +139,7 @@ def collect_rollouts(settings: Settings, folder: Path, executor: Executor | None
         OSError: the disk has not enough room for them, or another process works in the folder.
         TaskError: an episode failed.
     """
-    made_with = {field: getattr(settings, field) for field in COLLECT_FIELDS}
+    made_with = {field: getattr(settings, field) for field in COLLECT_SETTINGS}
     tasks = [(settings, index) for index in range(settings.episodes)]
     with worker_processes(settings.processes, executor) as executor:
         return collect(folder, made_with, drive_randomly, tasks, [settings.episode_frames] * len(tasks), executor)
@@ -285,7 +285,7 @@ class Rollouts:
             self.frames.read(episode, [moments[place], before[place]], [frames[place], earlier[place]])
         return frames, earlier
 
-    def split(self, heldout: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of training frames and of held-out frames: whole episodes, the last ones, at least one."""
-        first = len(self.frames) - max(1, round(heldout * len(self.frames)))
+    def split(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of training and of held-out frames: the last twentieth of the episodes, at least one, is held out."""
+        first = len(self.frames) - max(1, round(len(self.frames) / 20))
         return np.flatnonzero(self.episode < first), np.flatnonzero(self.episode >= first)

@@ -20,7 +20,7 @@ from stad_lab.controller import ACTION_SIZE, seen_columns, unpack
 from stad_lab.evolution import CONTROLLER, hand_out, make_agent
 from stad_lab.frames import to_frame
 from stad_lab.parallel import work_alone, worker_processes
-from stad_lab.rollouts import AGENT_FIELDS, COLLECT_FIELDS, Rollouts, collect, drive_randomly, track_seeds
+from stad_lab.rollouts import AGENT_SETTINGS, COLLECT_SETTINGS, Rollouts, collect, drive_randomly, track_seeds
 from stad_lab.search_space import START, features, load_start, save_start, sizes
 from stad_lab.settings import Settings
 
@@ -49,7 +49,7 @@ def collect_again(
         OSError, TaskError: as `collect_rollouts`.
     """
     parameters, _ = load_controller(earlier / CONTROLLER, variant)
-    made_with = {field: getattr(settings, field) for field in (*COLLECT_FIELDS, *AGENT_FIELDS)}
+    made_with = {field: getattr(settings, field) for field in (*COLLECT_SETTINGS, *AGENT_SETTINGS)}
     made_with |= {"variant": variant, "controller_sha256": checksum((earlier / CONTROLLER).read_bytes())}
     numbers = order_of_episodes(settings)
     longest = [settings.episode_frames if number < settings.episodes else settings.max_frames for number in numbers]

@@ -103,7 +103,7 @@ class Settings:
     cars: int = 16
     """Cars that one process drives in step, at most, with one batch through V and M. Fewer keep more processes busy."""
     validate_every: int = 5
-    """Generations between two looks at the CMA mean on the validation tracks."""
+    """Generations between two looks at C so far on the validation tracks."""
     validation_tracks: int = 16
     """Tracks of such a look."""
     averaged_share: float = 0.4

@@ -72,19 +72,13 @@ def fit(
             watch(history)
         progress = tqdm(read_ahead(batch, range(start, steps)), label, steps, initial=start, unit="step")
         for step, present in progress:
-            for group in optimizer.param_groups:
-                group["lr"] = learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps))
             found = losses(*present)
             if not torch.isfinite(found["total"]):
                 raise FloatingPointError(
                     f"{label}: the loss is {found['total'].item()} in step {step}: lower the learning rate, in a new"
                     " folder"
                 )
-            optimizer.zero_grad(set_to_none=True)
-            found["total"].backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 100.0)
-            optimizer.step()
-            return_freed_memory()
+            update(model, optimizer, found["total"], learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps)))
             for name, loss in found.items():
                 sums[name] = sums.get(name, 0.0) + loss.item()
             if (step + 1) % every == 0 or step + 1 == steps:
@@ -101,6 +95,17 @@ def fit(
         print(f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint")
         raise
     return history
+
+
+def update(model: torch.nn.Module, optimizer: torch.optim.Optimizer, total: torch.Tensor, rate: float) -> None:
+    """One step of Adam against the gradient of `total`, which is shortened to a norm of 100."""
+    for group in optimizer.param_groups:
+        group["lr"] = rate
+    optimizer.zero_grad(set_to_none=True)
+    total.backward()
+    torch.nn.utils.clip_grad_norm_(model.parameters(), 100.0)
+    optimizer.step()
+    return_freed_memory()
 
 
 def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[int, tuple]]:

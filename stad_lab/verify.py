@@ -26,7 +26,7 @@ from stad_lab.evolution import (
 )
 from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.parallel import TaskError, run_in_order, worker_processes
-from stad_lab.pipeline import EARLIER, MACHINE, PACKAGES, provenance, starts
+from stad_lab.pipeline import GIVE_A_RUN, MACHINE, PACKAGES, provenance, starts
 from stad_lab.rollouts import Rollouts, check_seen
 from stad_lab.search_space import search_space
 from stad_lab.settings import Settings
@@ -50,7 +50,7 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         ValueError: the record itself is damaged, or of a driver without V, M and C.
     """
     folder = Path(folder)
-    record = load_json(folder / "record.json", EARLIER)
+    record = load_json(folder / "record.json", GIVE_A_RUN)
     if "settings" not in record:
         raise ValueError(f"{folder} is of {record['variant']}, which has no V, M and C: there is nothing to verify")
     variant, settings = record["variant"], Settings.from_dict(record["settings"])

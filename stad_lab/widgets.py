@@ -17,8 +17,7 @@ from pygments import highlight
 from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
-from stad_lab.autoencoder import AutoEncoder, to_array
-from stad_lab.dream import to_uint8
+from stad_lab.autoencoder import AutoEncoder, to_array, to_uint8
 from stad_lab.drives import Drive, Inside
 from stad_lab.plots import difference_colors, plot_moment, to_png
 
