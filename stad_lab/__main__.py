@@ -40,6 +40,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m stad_lab", description="Teach a car to drive with a model of its world (STAD)."
     )
+    parser.set_defaults(resumes=False)
     commands = parser.add_subparsers(dest="command", required=True)
     for add in (
         add_check,
@@ -66,8 +67,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        resumes = options.command in ("train", "finish", "study", "replicate")
-        print(f"\nstopped{'; the same command goes on from the last checkpoint' * resumes}", file=sys.stderr)
+        again = "; the same command goes on from the last checkpoint" if options.resumes else ""
+        print(f"\nstopped{again}", file=sys.stderr)
         return 130
 
 
@@ -98,9 +99,9 @@ def add_scheduler(command: argparse.ArgumentParser) -> None:
     )
 
 
-def add_changes(command: argparse.ArgumentParser, help: str) -> None:
+def add_changes(command: argparse.ArgumentParser, what: str) -> None:
     """The option --set."""
-    command.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=help)
+    command.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=what)
 
 
 def add_parts(command: argparse.ArgumentParser, parts: Iterable[str]) -> None:
@@ -180,7 +181,7 @@ def add_train(commands: argparse._SubParsersAction) -> None:
         "change one setting of the preset, for example --set stride=2; may be repeated."
         f" The settings: {', '.join(field.name for field in dataclasses.fields(Settings))}",
     )
-    command.set_defaults(do=do_train)
+    command.set_defaults(do=do_train, resumes=True)
 
 
 def do_train(options: argparse.Namespace) -> None:
@@ -210,7 +211,7 @@ def add_finish(commands: argparse._SubParsersAction) -> None:
         "change one setting of the finish; may be repeated. It is the run's, but for"
         f" {', '.join(f'{name}={value}' for name, value in FINISH.items())}. These may change: {', '.join(OPEN)}",
     )
-    command.set_defaults(do=do_finish)
+    command.set_defaults(do=do_finish, resumes=True)
 
 
 def do_finish(options: argparse.Namespace) -> None:
@@ -296,7 +297,7 @@ def add_replicate(commands: argparse._SubParsersAction) -> None:
     command.add_argument(
         "--keep", action="store_true", help="only copy the records of the finished seeds to stad_lab/records/table"
     )
-    command.set_defaults(do=do_replicate)
+    command.set_defaults(do=do_replicate, resumes=True)
 
 
 def do_replicate(options: argparse.Namespace) -> None:
@@ -323,7 +324,7 @@ def add_study(commands: argparse._SubParsersAction) -> None:
     command.add_argument("--out", required=True, type=Path, help="folder for what is trained, and for study.json")
     command.add_argument("--rollouts", type=Path, help="folder of the rollouts; default OUT/rollouts")
     add_parts(command, STUDY_PARTS)
-    command.set_defaults(do=do_study)
+    command.set_defaults(do=do_study, resumes=True)
 
 
 def do_study(options: argparse.Namespace) -> None:

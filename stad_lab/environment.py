@@ -21,8 +21,8 @@ COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
 LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = (
-    *("numpy", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma", "sklearn", "safetensors", "matplotlib"),
-    *("PIL", "ipywidgets"),
+    *("numpy", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma", "sklearn", "scipy", "safetensors"),
+    *("matplotlib", "PIL", "ipywidgets"),
 )
 
 

@@ -197,14 +197,16 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     v_path = path.with_name("autoencoder.safetensors")
     autoencoder, v_facts = load_autoencoder(v_path, variant)
     check_facts(v_path, v_facts, settings)
-    check_seen(v_path, v_facts["rollouts"], rollouts_folder)
     if path.exists():
         facts = load_mdn_rnn(path, variant)[1]
         check_facts(path, facts, settings)
         check_partner(path, facts, autoencoder=v_facts["identity"])
+        check_seen(path, v_facts["rollouts"], rollouts_folder)
         checkpoint_of(path).unlink(missing_ok=True)  # of a process that was killed before it did
         return False
     rollouts = Rollouts(rollouts_folder)
+    if v_facts["rollouts"] != rollouts.identity:
+        raise ValueError(f"{v_path} was trained on other rollouts than those in {rollouts_folder}: give its own ones")
     torch.manual_seed(settings.seed)
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)

@@ -322,8 +322,8 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     """Copy what a run has trained into `stad_lab/pretrained/`: records as they are, V and M in half precision.
 
     Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run. A second
-    round, or a finish, goes into a folder `second_round` of its own; returns the new folder. What an agent that was
-    shipped before has there, and this run has not, is removed.
+    round, or a finish, goes into a folder `second_round` of its own; returns the new folder. All else that is there,
+    of an agent that was shipped before, is removed, its evaluation too.
 
     Raises:
         FileNotFoundError: the run has no V.
@@ -332,15 +332,15 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     folder = Path(folder)
     load_autoencoder(folder / WEIGHTS[0], variant)
     target = target / "second_round" / variant if (folder / START).exists() else target / variant
-    read = {name: load_tensors(folder / name) for name in WEIGHTS if (folder / name).exists()}  # all, before any goes
+    shipped = [name for name in (*WEIGHTS, "record.json", LOG) if (folder / name).exists()]
+    read = {name: load_tensors(folder / name) for name in shipped if name in WEIGHTS}  # all, before any is written
     target.mkdir(parents=True, exist_ok=True)
     for name, (tensors, facts) in read.items():
         small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
         save_tensors(target / name, small, **facts)
-    for name in ("record.json", LOG):
-        if (folder / name).exists():
-            copy_file(folder / name, target)
-    for name in (*WEIGHTS, LOG):
-        if not (folder / name).exists():
-            (target / name).unlink(missing_ok=True)
+    for name in shipped[len(read) :]:
+        copy_file(folder / name, target)
+    for file in target.glob("*.*"):
+        if file.name not in shipped:
+            file.unlink()
     return target

@@ -33,7 +33,7 @@ from stad_lab.mdn_rnn import MDNRNN
 from stad_lab.parallel import run_in_order, worker_processes
 from stad_lab.pipeline import provenance, train
 from stad_lab.rollouts import RandomDriver, collect_rollouts
-from stad_lab.rows import FLOORS, ROWS, Row, find_row
+from stad_lab.rows import ROWS, Row, find_row, is_floor
 from stad_lab.search_space import COMPONENTS, START
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.table import RECORDS, TOP, summarise, worlds
@@ -60,7 +60,7 @@ def replicate(
         ValueError: an unknown row or seed, or a folder with something else in it.
         OSError, TaskError, FloatingPointError: as `train` and `evaluate`.
     """
-    if name in FLOORS and not seeds:
+    if is_floor(name, seeds):
         return drive_floor(name, Path(folder) / name / "seed0", executor)
     row, folder = find_row(name, seeds), Path(folder)
     folders = {seed: folder / name / f"seed{seed}" for seed in row.seeds}
@@ -168,12 +168,12 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[
         seeds: as of `replicate`.
     """
     kept = []
-    for seed in (0,) if name in FLOORS and not seeds else find_row(name, seeds).seeds:
+    for seed in (0,) if is_floor(name, seeds) else find_row(name, seeds).seeds:
         source = Path(folder) / name / f"seed{seed}"
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
-    with_seed_0 = bool(kept) and kept[0].name == "seed0"
+    with_seed_0 = bool(kept) and (Path(folder) / name / "seed0" / "evaluation.json").exists()
     known = worlds(kept) <= worlds([path for path in (target / name).glob("seed*") if path not in kept])
     for part in ("first", "world"):
         if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
@@ -204,7 +204,7 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
 
     An agent's episode is taken to have as many frames as it may have at most, so the searches may be quicker.
     """
-    if name in FLOORS and not seeds:
+    if is_floor(name, seeds):
         return {"evaluations": TRACKS * 1000 / (Settings().processes * blind_speed(name))}
     row = find_row(name, seeds)
     if row.base:

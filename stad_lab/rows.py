@@ -105,10 +105,15 @@ ABLATIONS = {
 ROWS = make_rows()
 
 
+def is_floor(name: str, seeds: Sequence[int] | None = None) -> bool:
+    """Whether a row is one of FLOORS. Raises ValueError if seeds are wanted of one, since it has none."""
+    if name in FLOORS and seeds:
+        raise ValueError(f"row {name!r} is no search and has no seeds: leave them out")
+    return name in FLOORS
+
+
 def find_row(name: str, seeds: Sequence[int] | None = None) -> Row:
     """The row of a name, if wanted with some of its seeds alone. Raises ValueError if there is no such row or seed."""
-    if name in FLOORS:
-        raise ValueError(f"row {name!r} is no search and has no seeds: leave them out")
     if name not in ROWS:
         raise ValueError(f"unknown row {name!r}: choose one of {', '.join([*ROWS, *FLOORS])}")
     row = ROWS[name]

@@ -319,6 +319,7 @@ def test_a_shipped_agent_acts_almost_like_the_run_it_comes_from(quick_run, agent
 
 def test_a_damaged_run_is_not_shipped_and_one_without_c_leaves_none_of_before(quick_run, tmp_path):
     run, target = shutil.copytree(quick_run, tmp_path / "run"), ship("input_output", quick_run, tmp_path / "shipped")
+    (target / "evaluation.json").write_text("{}")  # of the agent that was shipped
     before = {file.name: file.read_bytes() for file in target.iterdir()}
     (run / "controller.safetensors").write_bytes(b"cut short")
     with pytest.raises(ValueError, match=r"controller\.safetensors is damaged"):

@@ -102,6 +102,21 @@ def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, 
     assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
 
 
+def test_a_search_that_is_stopped_while_it_is_watched_goes_on_to_the_same_log(one_go, quick_run, tmp_path):
+    folder, seen = without_evolution(quick_run, tmp_path / "run"), []
+
+    def watch(generations):
+        seen.append(len(generations))
+        if seen == [1, 2]:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evolve("input_output", settings(processes=1), folder, watch=watch)
+    assert evolve("input_output", settings(processes=1), folder, watch=watch)
+    assert not evolve("input_output", settings(processes=1), folder, watch=watch)  # shown, not repeated
+    assert read(folder) == read(one_go) and seen == [1, 2, *range(2, GENERATIONS + 1), GENERATIONS]
+
+
 def test_a_complete_evolution_is_left_alone(one_go):
     before = {path: path.stat().st_mtime_ns for path in one_go.iterdir()}
     assert not evolve("input_output", settings(processes=1), one_go)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import ttest_ind
+from scipy.stats import f, ttest_ind
 
 from stad_lab import make_env
 from stad_lab.agent import PRETRAINED
@@ -243,7 +243,7 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     right, left = sharpest_bends(range(100, 200))
     failed = sum(returns[100:] < 800 for returns in fast.values())
     assert 0.4 < failed[right].sum() / failed.sum() < 0.6
-    assert not any((fast[stage, "frame"][100:] < 800)[right].any() for stage in STAGES)
+    assert not any((fast[stage, "frame"][100:] < 800)[[*right, *left]].any() for stage in STAGES)
     always = {v: np.flatnonzero((returns[f"two_rounds_{v}"] < 800).all(axis=0)).tolist() for v in VARIANTS}
     assert always == {"frame": [], "input": [2, 68], "output": [2, 19], "input_output": []}
     assert np.flatnonzero((returns["finished_input"] < 800).all(axis=0)).tolist() == [2, 19, 68]
@@ -261,9 +261,14 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert speed["frame"] > 0.95 and all(0.75 < share < 0.85 for v, share in speed.items() if v != "frame")
     both = set(right) & set(left)
     groups = [sorted(group) for group in (both, both - {25}, set(right) - both, set(left) - both)]
-    assert [(failed[group].sum(), len(fast) * len(group)) for group in groups] == [(8, 32), (3, 24), (3, 48), (1, 48)]
     groups.append(sorted(set(range(100)) - set(right) - set(left)))
     assert [((failed[group] > 0).sum(), len(group)) for group in groups] == [(3, 4), (2, 3), (2, 6), (1, 6), (8, 84)]
+    fail = {v for stage, v in fast if v != "input" and (fast[stage, v][100:] < 800)[groups[1]].any()}
+    assert not fail and failed[25]  # of the three, on all but 125 only agents of `input` fail
+    gains = [fast["finished", v].mean() - fast["two_rounds", v].mean() for v in VARIANTS]
+    assert [round(float(gain)) for gain in (min(gains), max(gains))] == [9, 17]
+    gains = [returns[f"finished_{v}"].mean() - returns[f"two_rounds_{v}"].mean() for v in VARIANTS]
+    assert [round(float(gain)) for gain in (min(gains), max(gains))] == [2, 14]
     assert 0 < fast["two_rounds", "output"].mean() - fast["two_rounds", "frame"].mean() < 1
     assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
 
@@ -272,10 +277,14 @@ def test_the_words_on_luck_in_the_searches_hold_for_the_records():
     rows, luck = kept_rows(), {}
     for recipe, variant in itertools.product(STAGES, ("input", "output", "input_output")):
         means = [official_returns(rows[f"{recipe}_{name}"]).mean(axis=1) for name in ("frame", variant)]
-        luck[recipe, variant] = round(100 * float(ttest_ind(*means, equal_var=False).pvalue))
-    assert luck.pop(("finished", "input_output")) == 1 and {min(luck.values()), max(luck.values())} == {6, 8}
-    before = [1 / (luck["two_rounds", variant] / 100) for variant in ("input", "output", "input_output")]
-    assert min(before) >= 14 and max(before) <= 18
+        luck[recipe, variant] = float(ttest_ind(*means, equal_var=False).pvalue)
+    cases = {pair: round(100 * share) for pair, share in luck.items()}
+    assert cases.pop(("finished", "input_output")) == 1 and {min(cases.values()), max(cases.values())} == {6, 8}
+    assert sorted(round(1 / share) for (recipe, _), share in luck.items() if recipe == "two_rounds") == [14, 18, 18]
+    first, second = (
+        official_returns(rows[name]).mean(axis=1).var(ddof=1) for name in ("one_round", "two_rounds_input")
+    )
+    assert 0.2 < 2 * f.sf(first / second, 2, 2) < 0.3  # "about one case of four"
 
 
 def test_the_results_tell_what_every_single_change_is_worth():
@@ -304,7 +313,6 @@ def test_the_words_on_single_changes_hold_for_the_records():
     assert among == ["no_M", "no_z", "untrained_M", "stride_2", "stride_8"] and means["no_bar"] < searches.min()
     few = official_returns(rows["few_agents"])
     assert round(float(base.mean() - few.mean())) == 51 and few.mean() < searches.min()
-    assert round(float(np.median(few))) == 909
     assert [round(float(searches.min() - means[name])) for name in ("few_agents", "no_bar")] == [22, 50]
     assert [round(100 * float(share)) for share in (base >= 900).mean(axis=1)] == [57, 88, 81]
     strides = [official_returns(rows[f"stride_{stride}"]) for stride in (1, 2, 8)]

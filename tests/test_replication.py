@@ -290,6 +290,12 @@ def test_some_seeds_of_a_row_can_be_made_alone(table, monkeypatch):
     assert forecast("untrained_M")["M"] == whole["M"] > 0  # the world that it shares has a trained M
 
 
+def test_seeds_that_are_kept_one_after_the_other_leave_one_record_of_their_training(table, tmp_path):
+    assert [path.name for path in keep("two", table[0], tmp_path, seeds=[1])] == ["seed1"]
+    keep("two", table[0], tmp_path)
+    assert {path.name for path in (tmp_path / "two").iterdir()} == {"first", "world", "seed0", "seed1"}
+
+
 def test_the_command_keeps_what_is_finished(tmp_path, capsys):
     assert main(["replicate", "--row", "one_round", "--out", str(tmp_path), "--keep"]) == 0
     assert "no seed is finished" in capsys.readouterr().out
