@@ -131,6 +131,29 @@ def test_the_words_on_the_probe_hold_for_the_study():
     assert all(r2("bar", v, "yaw rate") <= r2("bar", "frame", "yaw rate") + 0.01 for v in VARIANTS)
 
 
+def test_the_words_on_v_and_m_in_notebooks_02_and_03_hold_for_the_study():
+    study = read("study.json")
+    prices = study["autoencoder"]["rate_distortion"]
+
+    def saved(dear, cheap):
+        """Error that a nat saves between two prices of the KL."""
+        errors = [prices[price]["frame_error"] + prices[price]["difference_error"] for price in (dear, cheap)]
+        return (errors[0] - errors[1]) / (prices[cheap]["kl"] - prices[dear]["kl"])
+
+    steps = itertools.pairwise(sorted(prices, key=float, reverse=True))
+    assert all(float(cheap) < saved(dear, cheap) < float(dear) for dear, cheap in steps)
+    assert (round(saved("4", "1"), 1), round(saved("0.25", "0.08"), 2)) == (1.9, 0.14)
+    assert [study["autoencoder"]["variants"][variant]["active"] for variant in VARIANTS] == [15, 17, 16, 27]
+    assert round(study["mdn_rnn"]["variants"]["input"]["horizon"]["one dream"][-1], 2) == 1.21 < np.sqrt(1.5)
+    speed = [study["probe"]["variants"]["trained agent"][variant] for variant in VARIANTS]
+    memories = ("z, h", "z, h of an untrained M")
+    trained, untrained = ([found[name]["forward speed"]["r2"] for found in speed] for name in memories)
+    gains = np.subtract(trained, untrained)
+    assert (round(gains.min(), 2), round(gains.max(), 2)) == (0.03, 0.19)
+    slip = [study["bar"]["variants"][driver]["frame"]["z"]["slip speed"]["r2"] for driver in study["bar"]["variants"]]
+    assert [round(r2, 2) for r2 in slip] == [0.38, 0.78]
+
+
 def test_the_cluster_page_says_what_the_record_says():
     result = read("cluster.json")["cluster"]
     for name, value in result["frames a second, a generation"].items():
