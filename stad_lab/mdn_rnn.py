@@ -206,7 +206,10 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
         return False
     rollouts = Rollouts(rollouts_folder)
     if v_facts["rollouts"] != rollouts.identity:
-        raise ValueError(f"{v_path} was trained on other rollouts than those in {rollouts_folder}: give its own ones")
+        raise ValueError(
+            f"{v_path} was trained on other rollouts than those in {rollouts_folder}, or does not tell on which: give"
+            " its own ones"
+        )
     torch.manual_seed(settings.seed)
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)

@@ -13,6 +13,7 @@ at the road. Whatever is there already is not done again.
 """
 
 import dataclasses
+import shutil
 import tempfile
 import time
 from collections.abc import Sequence
@@ -162,7 +163,7 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[
     With them go the records and the losses of the first round and of the world, if the row has its own. Seeds that are
     made elsewhere, in a folder without seed 0, may have V and M from another training by the same settings. If so, the
     records of that one go to `first_of_seed1` and `world_of_seed1`, by the first of these seeds; if not, they are there
-    already.
+    already, or come with seed 0 and replace those.
 
     Args:
         seeds: as of `replicate`.
@@ -173,13 +174,17 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
-    with_seed_0 = bool(kept) and (Path(folder) / name / "seed0" / "evaluation.json").exists()
+    source_of_0 = Path(folder) / name / "seed0"
+    with_seed_0 = bool(kept) and (source_of_0 / "evaluation.json").exists()
     known = worlds(kept) <= worlds([path for path in (target / name).glob("seed*") if path not in kept])
     for part in ("first", "world"):
         if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
             own = part if with_seed_0 else f"{part}_of_{kept[0].name}"
             copy_records(Path(folder) / name / part, target / name / own)
             keep_histories(Path(folder) / name / part, target / name / own)
+        for twin in (target / name).glob(f"{part}_of_seed*") if with_seed_0 else ():
+            if worlds([target / name / twin.name.removeprefix(f"{part}_of_")]) <= worlds([source_of_0]):
+                shutil.rmtree(twin)
     return kept
 
 

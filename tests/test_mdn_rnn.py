@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from stad_lab.checkpoints import load_tensors
+from stad_lab.checkpoints import load_json, load_tensors, save_json
 from stad_lab.mdn_rnn import (
     MDNRNN,
     Mixture,
@@ -274,6 +274,15 @@ def test_an_interrupted_training_equals_an_uninterrupted_one_bit_for_bit(quick_r
     assert all(torch.equal(one_go[name], resumed[name]) for name in one_go | resumed)
     assert one_go_facts == resumed_facts
     assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_m_is_not_trained_on_other_rollouts_than_its_v(quick_run, tmp_path):
+    rollouts = shutil.copytree(quick_run / "rollouts", tmp_path / "rollouts")
+    manifest = load_json(rollouts / "manifest.json")
+    save_json(rollouts / "manifest.json", manifest | {"blocks": manifest["blocks"][::-1]})
+    shutil.copy(quick_run / "autoencoder.safetensors", tmp_path)
+    with pytest.raises(ValueError, match="was trained on other rollouts than those in"):
+        train_mdn_rnn("input_output", Settings.preset("quick"), rollouts, tmp_path)
 
 
 def test_saved_weights_are_loaded_to_the_same_predictions(tmp_path):

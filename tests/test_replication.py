@@ -291,9 +291,13 @@ def test_some_seeds_of_a_row_can_be_made_alone(table, monkeypatch):
 
 
 def test_seeds_that_are_kept_one_after_the_other_leave_one_record_of_their_training(table, tmp_path):
-    assert [path.name for path in keep("two", table[0], tmp_path, seeds=[1])] == ["seed1"]
-    keep("two", table[0], tmp_path)
-    assert {path.name for path in (tmp_path / "two").iterdir()} == {"first", "world", "seed0", "seed1"}
+    without_0 = tmp_path / "without_0" / "two"
+    shutil.copytree(table[0] / "two", without_0, ignore=shutil.ignore_patterns("seed0", "rollouts"))
+    for source in (table[0], without_0.parent):  # with seed 0 beside it, and from another machine
+        kept = tmp_path / "kept" / source.name
+        assert [path.name for path in keep("two", source, kept, seeds=[1])] == ["seed1"]
+        keep("two", table[0], kept)
+        assert {path.name for path in (kept / "two").iterdir()} == {"first", "world", "seed0", "seed1"}
 
 
 def test_the_command_keeps_what_is_finished(tmp_path, capsys):
