@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import f, ttest_ind
+from scipy.stats import f, t, ttest_ind
 
 from stad_lab import make_env
 from stad_lab.agent import PRETRAINED
@@ -297,6 +297,18 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert [round(float(gain)) for gain in (min(gains), max(gains))] == [2, 14]
     assert 0 < fast["two_rounds", "output"].mean() - fast["two_rounds", "frame"].mean() < 1
     assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
+
+
+def test_the_words_on_the_rows_without_the_bar_hold_for_the_records():
+    rows = kept_rows()
+    blind, shown, base = (official_returns(rows[name]) for name in ("no_bar_frame", "no_bar", "one_round"))
+    gap = blind.mean() - shown.mean()
+    low, high = bootstrap_gain(blind, shown)
+    assert f"They have {shown.mean():.1f} and {blind.mean():.1f}, so `input` is {gap:.1f} points behind" in RESULTS
+    assert f"({-low:.1f} behind to {high:.1f} ahead, for the luck in the tracks alone)" in RESULTS
+    assert (blind < 800).sum() == (shown < 800).sum() == 18
+    assert (round(float(blind.mean())), round(float(shown.mean()))) == (845, 810)  # README, notebook 05
+    assert 0.4 < 2 * t.sf(gap / (base.mean(axis=1).std(ddof=1) * np.sqrt(2)), 2) < 0.6
 
 
 def test_the_words_on_luck_in_the_searches_hold_for_the_records():
