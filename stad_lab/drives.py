@@ -154,7 +154,16 @@ def encode_drive(autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: 
 @torch.no_grad()
 def remember_drive(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """M's memory before every frame of a drive: mu (T, latent_size), actions (T, 3) -> float32 (T, hidden_size)."""
-    after, _ = mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)
+    return memory_before(remember_frames(mdn_rnn, latents, actions))
+
+
+def remember_frames(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> torch.Tensor:
+    """M's memory after every frame of a drive: float32 (1, T, hidden_size)."""
+    return mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)[0]
+
+
+def memory_before(after: torch.Tensor) -> np.ndarray:
+    """M's memory before every frame, float32 (T, hidden_size), from that after it; before the first it is empty."""
     return torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)[0].numpy()
 
 
@@ -163,8 +172,8 @@ def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride:
     """Show V and M a drive from its first frame on, and keep all they make of it; stride and bar as V was trained."""
     frames = drive.frames(crop_bar)
     mu, logvar = encode_frames(autoencoder, frames, stride)
-    hidden = remember_drive(mdn_rnn, mu, drive.actions)
-    mixture, _ = mdn_rnn(torch.from_numpy(mu)[None], torch.from_numpy(drive.actions)[None])
+    after = remember_frames(mdn_rnn, mu, drive.actions)
+    hidden, mixture = memory_before(after), mdn_rnn.mixture(after)
     drawn, changed = autoencoder.decode(torch.from_numpy(mu))
     changed = None if changed is None else to_array(changed)
     return Inside(frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, logvar, hidden, mixture)

@@ -205,11 +205,9 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
         checkpoint_of(path).unlink(missing_ok=True)  # of a process that was killed before it did
         return False
     rollouts = Rollouts(rollouts_folder)
-    if v_facts["rollouts"] != rollouts.identity:
-        raise ValueError(
-            f"{v_path} was trained on other rollouts than those in {rollouts_folder}, or does not tell on which: give"
-            " its own ones"
-        )
+    check_seen(v_path, v_facts["rollouts"], rollouts_folder)
+    if v_facts["rollouts"] is None:
+        raise ValueError(f"{v_path} does not tell on which rollouts it was trained: train it again in another folder")
     torch.manual_seed(settings.seed)
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)

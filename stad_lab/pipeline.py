@@ -338,8 +338,9 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     for name, (tensors, facts) in read.items():
         small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
         save_tensors(target / name, small, **facts)
-    for name in shipped[len(read) :]:
-        copy_file(folder / name, target)
+    for name in shipped:
+        if name not in read:
+            copy_file(folder / name, target)
     for file in target.glob("*.*"):
         if file.name not in shipped:
             file.unlink()

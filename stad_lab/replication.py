@@ -174,18 +174,25 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[
         if (source / "evaluation.json").exists():
             kept.append(target / name / source.name)
             copy_records(source, kept[-1])
-    source_of_0 = Path(folder) / name / "seed0"
-    with_seed_0 = bool(kept) and (source_of_0 / "evaluation.json").exists()
+    seed_0 = Path(folder) / name / "seed0"
+    with_seed_0 = bool(kept) and (seed_0 / "evaluation.json").exists()
     known = worlds(kept) <= worlds([path for path in (target / name).glob("seed*") if path not in kept])
     for part in ("first", "world"):
         if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
             own = part if with_seed_0 else f"{part}_of_{kept[0].name}"
             copy_records(Path(folder) / name / part, target / name / own)
             keep_histories(Path(folder) / name / part, target / name / own)
-        for twin in (target / name).glob(f"{part}_of_seed*") if with_seed_0 else ():
-            if worlds([target / name / twin.name.removeprefix(f"{part}_of_")]) <= worlds([source_of_0]):
-                shutil.rmtree(twin)
+    if with_seed_0:
+        remove_twins(target / name, seed_0)
     return kept
+
+
+def remove_twins(row: Path, seed_0: Path) -> None:
+    """Remove the records of a training that was kept under a later seed's name and is that of seed 0, too."""
+    for twin in [*row.glob("first_of_seed*"), *row.glob("world_of_seed*")]:
+        _, seed = twin.name.split("_of_")
+        if worlds([row / seed]) == worlds([seed_0]):
+            shutil.rmtree(twin)
 
 
 def keep_histories(source: Path, target: Path) -> None:
