@@ -1,6 +1,6 @@
 """The command line, `python -m stad_lab`.
 
-Commands: check, train, finish, evaluate, verify, replicate, study, benchmark, ship, film.
+Commands: check, train, finish, evaluate, verify, replicate, table, study, benchmark, ship, film.
 """
 
 import argparse
@@ -32,6 +32,7 @@ from stad_lab.rows import FLOORS, ROWS
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
 from stad_lab.study import study
+from stad_lab.table import RECORDS, claims_and_outcomes, describe_table, kept_rows
 from stad_lab.verify import verify
 
 
@@ -49,6 +50,7 @@ def build_parser() -> argparse.ArgumentParser:
         add_evaluate,
         add_verify,
         add_replicate,
+        add_table,
         add_study,
         add_benchmark,
         add_ship,
@@ -309,6 +311,39 @@ def do_replicate(options: argparse.Namespace) -> None:
     with drivers(options.scheduler) as executor:
         print(describe_forecast(options.row, forecast(options.row, options.seeds)), flush=True)
         print(describe_row(options.row, replicate(options.row, options.out, executor, options.seeds)))
+
+
+def add_table(commands: argparse._SubParsersAction) -> None:
+    """The command table."""
+    command = commands.add_parser(
+        "table",
+        help="print the replication's table, and draw the claim beside the outcome",
+        description="Print a line of Markdown for each row that is made, from its records. With --picture, draw what"
+        " the paper reports of the four variants beside what came out here.",
+    )
+    command.add_argument(
+        "--records", type=Path, default=RECORDS, help="folder of rows, for example runs/table; default: ours"
+    )
+    command.add_argument("--picture", type=Path, help="the PNG to write, for example claims.png")
+    command.set_defaults(do=do_table)
+
+
+def do_table(options: argparse.Namespace) -> None:
+    """Print the table, and draw the picture."""
+    rows = kept_rows(options.records)
+    if not rows:
+        raise ValueError(
+            f"--records {options.records}: expected a folder in which `python -m stad_lab replicate` has finished a row"
+        )
+    if options.picture:
+        if options.picture.suffix.lower() != ".png":
+            raise ValueError(f"--picture {options.picture}: expected a file that ends in .png")
+        check_writable(options.picture)
+    print(describe_table(rows))
+    if options.picture:
+        from stad_lab.plots import plot_claims, to_png  # matplotlib takes a second, and workers import this file
+
+        write_bytes(options.picture, to_png(plot_claims(claims_and_outcomes(rows))))
 
 
 def add_study(commands: argparse._SubParsersAction) -> None:

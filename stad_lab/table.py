@@ -3,6 +3,7 @@
 The records that we report lie in `stad_lab/records/table`, a folder for each row as `stad_lab.replication` has it.
 """
 
+import itertools
 from collections import Counter
 from pathlib import Path
 
@@ -28,14 +29,52 @@ OTHERS = {  # the rest of that table
     "OpenAI": 838.0,
     "World Models": 906.0,
 }
+RECIPES = {  # rows RECIPE_VARIANT, and what the picture of the replication calls them
+    "paper": "its recipe here, v3",
+    "two_rounds": "our recipe, v3",
+    "finished": "ours, finished",
+}
 PAPER_BEST = {"best agent": 929.82, "best generation": 911.73}  # the highest points of its figures
 TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
 
 
 def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
-    """The rows that have been made: name -> folders of its seeds, in the order of FLOORS and ROWS."""
-    found = {name: sorted((records / name).glob("seed*")) for name in [*FLOORS, *ROWS]}
-    return {name: folders for name, folders in found.items() if folders}
+    """The rows that have been made: name -> folders of its finished seeds, in the order of FLOORS and ROWS."""
+    found = {name: sorted((records / name).glob("seed*/evaluation.json")) for name in [*FLOORS, *ROWS]}
+    return {name: [file.parent for file in files] for name, files in found.items() if files}
+
+
+def describe_table(rows: dict[str, list[Path]]) -> str:
+    """The table of the replication, in Markdown: a line for each of the rows of `kept_rows`."""
+    lines = [
+        "| row | seeds | V, M | mean of 100 tracks | 95% interval | above 900 | agents | episodes | frames |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for name, folders in rows.items():
+        found, planned = summarise(folders), len(ROWS[name].seeds) if name in ROWS else 1
+        seeds = f"{len(folders)} of {planned}" if len(folders) < planned else f"{len(folders)}"
+        low, high = found["interval"]
+        lines.append(
+            f"| `{name}` | {seeds} | {found['worlds']} | {found['mean']:.1f} | {low:.1f} to {high:.1f}"
+            f" | {found['above_900']:.0%} | {found['agents']:,.0f} | {found['episodes']:,.0f}"
+            f" | {found['frames'] / 1e6:.2f} M |"
+        )
+    return "\n".join(lines)
+
+
+def claims_and_outcomes(rows: dict[str, list[Path]]) -> dict[str, dict[str, tuple[float, list[float]]]]:
+    """What the paper reports of each variant, and what came out here, as a panel of `plots.plot_intervals`.
+
+    Returns:
+        variant -> "the paper, v0" or a name of RECIPES -> (mean return, its 95% interval), for the rows that are made.
+        The paper gives no interval.
+    """
+    scores = {variant: {"the paper, v0": (claim, [claim, claim])} for variant, claim in PAPER.items()}
+    for variant, (recipe, told) in itertools.product(PAPER, RECIPES.items()):
+        if f"{recipe}_{variant}" in rows:
+            returns = official_returns(rows[f"{recipe}_{variant}"])
+            scores[variant][told] = float(returns.mean()), bootstrap(returns)
+    return scores
 
 
 def stage_times(row: Path) -> dict[str, float]:

@@ -120,7 +120,19 @@ def test_help_names_every_option(command, options, capsys):
     assert [option for option in options if option not in text] == []
 
 
-COMMANDS = ["check", "train", "finish", "evaluate", "verify", "replicate", "study", "benchmark", "ship", "film"]
+COMMANDS = [
+    "check",
+    "train",
+    "finish",
+    "evaluate",
+    "verify",
+    "replicate",
+    "table",
+    "study",
+    "benchmark",
+    "ship",
+    "film",
+]
 
 
 def test_help_names_every_setting(capsys):

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stad_lab import replication
 from stad_lab.__main__ import main
@@ -303,6 +304,30 @@ def test_seeds_that_are_kept_one_after_the_other_leave_one_record_of_their_train
 def test_the_command_keeps_what_is_finished(tmp_path, capsys):
     assert main(["replicate", "--row", "one_round", "--out", str(tmp_path), "--keep"]) == 0
     assert "no seed is finished" in capsys.readouterr().out
+
+
+def test_the_command_prints_the_finished_seeds_of_rows_anywhere_and_draws_them_beside_the_claim(
+    table, tmp_path, capsys
+):
+    records = tmp_path / "records"
+    shutil.copytree(table[0] / "two", records / "two", ignore=shutil.ignore_patterns("rollouts"))
+    (records / "two" / "seed1" / "evaluation.json").unlink()
+    picture = tmp_path / "claims.png"
+    assert main(["table", "--records", str(records), "--picture", str(picture)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 3 and lines[2].startswith(f"| `two` | 1 of 2 | 1 | {table[1]['two']['seeds'][0]:.1f} |")
+    assert "input_output the paper, v0 902." in Image.open(picture).text["Description"]
+
+
+@pytest.mark.parametrize("options", [["--records", "empty"], ["--picture", "claims.jpg"]])
+def test_a_table_that_cannot_be_made_ends_in_one_line_before_anything_is_written(
+    options, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert main(["table", "--picture", "claims.png", *options]) == 2
+    told = capsys.readouterr()
+    assert told.err.startswith(f"error: {' '.join(options)}: expected a f") and not told.out
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_driver_that_does_not_look_is_a_row_like_any_other(tmp_path, monkeypatch):
