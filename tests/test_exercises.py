@@ -193,6 +193,14 @@ WRONG = [
         "solved = find_motion\ndef find_motion(x, earlier, *grid): return solved(earlier, x, *grid)",
         "this is the way back",
     ),
+    (
+        "01",
+        "find-motion-made-up",
+        "def find_motion(x, earlier, turns, forwards):\n"
+        "    wrap = {(t, f): ((move(earlier, t, f) - 1.0 * x) ** 2).mean() for t in turns for f in forwards}\n"
+        "    return min(wrap, key=wrap.get)",
+        "rows from 48 on",
+    ),
     ("01", "find-motion-made-up", "find_motion = lambda x, y, turns, forwards: turns[0]", "expected two numbers"),
     ("01", "find-motion-real", "find_motion = lambda x, y, turns, forwards: (0.0, 3.6)", "yaw rate 0.00 .*, truth 3"),
     ("01", "find-motion-real", "find_motion = lambda x, y, turns, forwards: (0.31, 0.0)", "speed 0.0, truth 4"),
@@ -251,6 +259,12 @@ WRONG = [
     (
         "02",
         "active-check",
+        "active = lambda kl: np.argsort(-np.median(kl, 0))[: (kl.mean(0) > 0.05).sum()]",
+        "the median over the frames",
+    ),
+    (
+        "02",
+        "active-check",
         "solved = active\nactive = lambda kl, threshold=0.05: solved(kl)",
         "threshold is not used",
     ),
@@ -272,6 +286,12 @@ WRONG = [
         "one norm over all frames",
     ),
     ("02", "reaction-check", "solved = reaction\ndef reaction(*given): return 1 / solved(*given)", "upside down"),
+    (
+        "02",
+        "reaction-check",
+        "solved = reaction\ndef reaction(vae, film, k): return solved(vae, film, 4)",
+        "stride is not used",
+    ),
     (
         "02",
         "mean-interval-check",
@@ -339,6 +359,13 @@ WRONG = [
         "horizon-check",
         "horizon = lambda dream, constant: int((dream.sum(0) > constant.sum(0)).argmax()) + 1",
         "argmax of no True",
+    ),
+    (
+        "03",
+        "horizon-check",
+        "horizon = lambda dream, constant: "
+        "min(len(dream.T), int(np.flatnonzero(dream.sum(0) <= constant.sum(0)).max()) + 2)",
+        "find the first place",
     ),
     (
         "03",
@@ -429,6 +456,13 @@ WRONG = [
         "difference-interval-check",
         "difference_interval = lambda a, b, rng: np.percentile(a - b, [2.5, 97.5])",
         "where a track lies",
+    ),
+    (
+        "04",
+        "difference-interval-check",
+        "difference_interval = lambda a, b, rng: "
+        "(a - b).mean() + np.array([-1.96, 1.96]) * (a - b).std(ddof=1) / 30**0.5",
+        "the formula with 1.96",
     ),
 ]
 
