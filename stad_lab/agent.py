@@ -69,6 +69,7 @@ class Agent:
         """
         self._check_count(len(observations))
         frames = np.stack([to_frame(observation, self.crop_bar) for observation in observations])
+        self.cars = np.arange(len(frames)) if self.cars is None else self.cars
         frame, difference = to_pictures(frames, self.memory.push(frames))
         latents, _ = self.autoencoder.encode(frame, difference)
         if self.state is None:
@@ -98,16 +99,16 @@ class Agent:
         self.latents, self.hidden, self.cars = self.latents[cars], self.hidden[cars], self.cars[cars]
 
     def _check_count(self, count: int) -> None:
-        if self.cars is None:
-            if self.parameters.ndim == 2 and count != len(self.parameters):
-                raise ValueError(
-                    f"{count} observations for {len(self.parameters)} controllers:"
-                    " expected one observation for each row of the parameters"
-                )
-            self.cars = np.arange(count)
-        if count != len(self.cars) or count == 0:
+        if count == 0:
+            raise ValueError("0 observations: expected at least 1")
+        if self.cars is None and self.parameters.ndim == 2 and count != len(self.parameters):
             raise ValueError(
-                f"{count} observations, expected {len(self.cars) or 'at least 1'}, as in the step before:"
+                f"{count} observations for {len(self.parameters)} controllers:"
+                " expected one observation for each row of the parameters"
+            )
+        if self.cars is not None and count != len(self.cars):
+            raise ValueError(
+                f"{count} observations, expected {len(self.cars)}, as in the step before:"
                 " call agent.reset() when an episode begins"
             )
 
@@ -134,8 +135,10 @@ def drive(
         The returns, float64 (tracks,), and the lengths in frames, int (tracks,).
 
     Raises:
-        ValueError: as `Agent.act_batch`.
+        ValueError: as `Agent.act_batch`, or fewer than one frame.
     """
+    if max_frames < 1:
+        raise ValueError(f"max_frames={max_frames}: expected at least 1")
     unseen = {"bar": False} if fast and agent.crop_bar else {}  # what V crops need not be drawn
     envs = [make_env(fast, **unseen) for _ in tracks]
     observations = [env.reset(seed=track)[0] for env, track in zip(envs, tracks, strict=True)]

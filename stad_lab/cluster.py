@@ -12,6 +12,7 @@ from typing import Any
 
 from distributed import Client, Future
 from distributed.cfexecutor import ClientExecutor
+from distributed.comm import get_address_host_port, parse_address
 
 PATIENCE = 60.0  # seconds to wait for a scheduler to answer and for its first worker
 SAME = ("stad_lab", "torch", "numpy", "gymnasium", "box2d", "opencv-python-headless")  # or the numbers would differ
@@ -55,12 +56,13 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
 
     Raises:
         OSError: no scheduler answers, or it has no worker.
-        ValueError: a worker that is there by now lacks a package, or has another version than this process, and so
-            would drive otherwise.
+        ValueError: no address of a scheduler; or a worker that is there by now lacks a package, or has another version
+            than this process, and so would drive otherwise.
     """
+    check_address(address)
     try:
         client = Client(address, timeout=patience, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
+    except (OSError, TimeoutError) as error:
         raise ConnectionError(
             f"no Dask scheduler answers at {address!r} ({error}): start one with `dask scheduler`, and give the address"
             " that it prints"
@@ -80,6 +82,17 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
                 f"a worker of {address} lacks a package ({error}): install the same environment.txt on all machines"
             ) from error
         yield ClusterExecutor(client, pure=False)
+
+
+def check_address(address: str) -> None:
+    """Raise ValueError unless an address is one of TCP; a Client that is given another leaves a process that hangs."""
+    try:
+        get_address_host_port(address)
+        known = parse_address(address)[0] == "tcp"
+    except ValueError:
+        known = False
+    if not known:
+        raise ValueError(f"scheduler {address!r}: expected the address that it prints, such as tcp://10.0.0.1:8786")
 
 
 def versions() -> dict[str, str]:

@@ -134,10 +134,12 @@ def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0)
         The dreamed frames, uint8 (frames, 64, 64, 3), and the actions, float32 (frames, 3).
 
     Raises:
-        ValueError: the agent has not acted since its last reset.
+        ValueError: the agent has not acted since its last reset, or drives several cars.
     """
     if agent.state is None:
         raise ValueError("the agent has not acted yet: let it drive a few real frames, then dream on")
+    if len(agent.cars) != 1:
+        raise ValueError(f"the agent drives {len(agent.cars)} cars: expected one; choose it with agent.keep")
     expected = agent.mdn_rnn.mixture(agent.state[0].transpose(0, 1))
     latents = sample_mixture(expected, temperature, torch.Generator().manual_seed(seed))[0, 0].numpy()
     env = DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature, frames, render_mode="rgb_array")

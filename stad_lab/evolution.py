@@ -114,8 +114,7 @@ def run_generation(
     """
     population = ask(strategy, settings, len(earlier))
     entry = drive_generation(executor, source, variant, settings, earlier, space.expand(population))
-    strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
-    means.append(strategy.mean.copy())
+    tell(strategy, population, entry["returns"], means)
     entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
     if entry["generation"] % settings.validate_every == 0:
         controller = space.expand(averaged_mean(means, settings))
@@ -250,6 +249,12 @@ def ask(strategy: "cma.CMAEvolutionStrategy", settings: Settings, generation: in
     return np.array(strategy.ask())
 
 
+def tell(strategy: "cma.CMAEvolutionStrategy", population: np.ndarray, returns: list, means: list) -> None:
+    """Tell CMA-ES, which minimises, what each agent of a population has returned on its tracks; adds to the means."""
+    strategy.tell(population, [-np.mean(own) for own in returns])
+    means.append(strategy.mean.copy())
+
+
 @threadpool_limits.wrap(limits=1)
 def replay(
     start: np.ndarray, settings: Settings, generations: list[dict]
@@ -262,8 +267,7 @@ def replay(
     strategy, means = make_strategy(start, settings), []
     for number, entry in enumerate(generations):
         population = ask(strategy, settings, number)
-        strategy.tell(population, [-np.mean(returns) for returns in entry["returns"]])
-        means.append(strategy.mean.copy())
+        tell(strategy, population, entry["returns"], means)
         if mean_checksum(strategy.mean) != entry["mean_checksum"]:
             raise ValueError(
                 f"replaying the log gives another mean in generation {number + 1} than the run had: the log was"

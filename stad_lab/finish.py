@@ -34,7 +34,7 @@ FINISH = {  # what it changes in the settings of the run that it goes on from
 OPEN = (*FINISH, "evolution_seed", "validation_tracks", "cars", "processes")  # what may be changed
 
 
-def finish_settings(earlier: str | Path, **changes) -> Settings:
+def finish_settings(earlier: str | Path, /, **changes) -> Settings:
     """The settings of a finish of the run in `earlier`: that run's, with those of FINISH and other changes.
 
     Raises:

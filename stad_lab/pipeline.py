@@ -327,11 +327,13 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
 
     Raises:
         FileNotFoundError: the run has no V.
-        ValueError: the run is damaged, or of another variant.
+        ValueError: the run is damaged, of another variant, or the shipped agent itself.
     """
     folder = Path(folder)
     load_autoencoder(folder / WEIGHTS[0], variant)
     target = target / "second_round" / variant if (folder / START).exists() else target / variant
+    if target.resolve() == folder.resolve():
+        raise ValueError(f"{folder} is where agents are shipped to: give the folder of a run")
     shipped = [name for name in (*WEIGHTS, "record.json", LOG) if (folder / name).exists()]
     read = {name: load_tensors(folder / name) for name in shipped if name in WEIGHTS}  # all, before any is written
     target.mkdir(parents=True, exist_ok=True)

@@ -191,26 +191,28 @@ class Session:
         return Dreamt(frames, latents, actions, by_hand)
 
     def _step_real(self) -> None:
-        action, motion = self._act(self.proposed), true_motion(self.env)
-        if self.driver == "hand":  # M remembered what the agent would have done: tell it what was done
+        driver = self.driver  # once: `give` may come from another thread in between
+        action, motion = self._act(driver, self.proposed), true_motion(self.env)
+        if driver == "hand":  # M remembered what the agent would have done: tell it what was done
             self.agent.take_in(action[None], self.before)
         following, reward, terminated, truncated, _ = self.env.step(action)
-        self.drivers.append(self.driver)  # first: who reads `drive` and then `by_hand` meanwhile has all of the latter
+        self.drivers.append(driver)  # first: who reads `drive` and then `by_hand` meanwhile has all of the latter
         self.rows.append((self.observation, action, reward, motion))
         self.observation, self.score = following, self.score + reward
         self.real_ended = terminated or truncated
         self._look()
 
     def _step_dream(self) -> None:
-        action = self._act(control(self.agent.parameters, np.concatenate([self.latents, self.hidden])[None])[0])
-        self.dream_rows.append((self.dream.render(), self.latents, action, self.driver == "hand"))
+        driver, seen = self.driver, np.concatenate([self.latents, self.hidden])
+        action = self._act(driver, control(self.agent.parameters, seen[None])[0])
+        self.dream_rows.append((self.dream.render(), self.latents, action, driver == "hand"))
         self.latents, _, _, self.dream_ended, info = self.dream.step(action)
         self.hidden = info["hidden"]
 
-    def _act(self, proposed: np.ndarray) -> np.ndarray:
-        if self.driver == "agent":
+    def _act(self, driver: str, proposed: np.ndarray) -> np.ndarray:
+        if driver == "agent":
             self.hand.action = proposed.copy()
-        return proposed if self.driver == "agent" else self.hand.act()
+        return proposed if driver == "agent" else self.hand.act()
 
     def _look(self) -> None:
         """Show the agent the present observation, and keep M's memory from before it."""

@@ -242,7 +242,7 @@ def plot_stacks(stacks: dict[str, dict[str, float]], title: str, xlabel: str) ->
     figure, ((axis,),) = new_figure(7.5, 0.42 * len(stacks) + 1.5)
     for place, parts in enumerate(stacks.values()):
         left = 0.0
-        for (part, value), color in zip(parts.items(), (BLUE, ORANGE, GREEN), strict=False):
+        for (part, value), color in zip(parts.items(), itertools.cycle(COLORS), strict=False):
             axis.barh(place, value, left=left, color=color, height=0.6, label=part if place == 0 else None)
             left += value
         axis.text(left, place, f" {left:.0f}", va="center", fontsize=9)

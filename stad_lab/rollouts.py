@@ -205,11 +205,12 @@ class EpisodeFrames(Sequence):
         return np.load(self.paths[index], allow_pickle=False)
 
     def read(self, index: int, moments: list[int], into: list[np.ndarray]) -> None:
-        """Read single frames of episode `index` into arrays uint8 (64, 64, 3)."""
+        """Read single frames of episode `index` into arrays uint8 (64, 64, 3). ValueError if the file was cut short."""
         with self.paths[index].open("rb", buffering=0) as file:
             for moment, frame in zip(moments, into, strict=True):
                 file.seek(NPY_HEADER + moment * frame.nbytes)
-                file.readinto(frame.data)
+                if file.readinto(frame.data) < frame.nbytes:
+                    raise ValueError(f"{self.paths[index]} is shorter than it was: collect in another folder")
 
 
 def identity_of(manifest: dict) -> str:

@@ -129,13 +129,13 @@ class Settings:
             )
 
     @staticmethod
-    def preset(name: str | None = None, **changes) -> "Settings":
+    def preset(name: str | None = None, /, **changes) -> "Settings":
         """Look up a preset by name.
 
         Args:
             name: "quick", "laptop" or "paper"; None reads the environment variable STAD_LAB_SETTINGS, and takes
                 "laptop" if that is not set.
-            **changes: fields to set differently, for example `stride=2`.
+            **changes: fields to set differently, for example `stride=2`; all but the name.
 
         Raises:
             ValueError: an unknown preset, an unknown field, or a value out of range.
@@ -143,6 +143,8 @@ class Settings:
         name = name or os.environ.get(ENVIRONMENT_VARIABLE) or "laptop"
         if name not in PRESETS:
             raise ValueError(f"unknown settings {name!r}: choose one of {', '.join(PRESETS)}")
+        if changes.get("name", name) != name:
+            raise ValueError(f"name={changes['name']!r} of the settings {name!r}: choose another preset instead")
         return dataclasses.replace(PRESETS[name], **known_fields(changes))
 
     def as_dict(self) -> dict:
@@ -174,9 +176,7 @@ FEATURES = ("z, h", "z", "h")
 
 def check_value(name: str, kind: type, value) -> None:
     """Raise ValueError unless `value` is a sensible value of the field `name`."""
-    if kind is float and type(value) is int:
-        value = float(value)
-    if type(value) is not kind:
+    if type(value) is not kind and not (kind is float and type(value) is int):
         raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
     if kind in (int, float):
         lowest = AT_LEAST.get(name, 0 if name in (*NO_LESS_THAN_ZERO, *SHARES) else 1 if kind is int else 1e-12)
@@ -220,7 +220,7 @@ PRESETS = {
         width=8,
         v_steps=40,
         v_batch=32,
-        hidden_size=32,
+        hidden_size=24,
         m_steps=20,
         m_batch=8,
         m_sequence=24,

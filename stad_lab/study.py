@@ -32,7 +32,7 @@ from stad_lab.drives import (
     remember_drive,
     road_in_sight,
 )
-from stad_lab.evaluation import bootstrap_interval
+from stad_lab.evaluation import bootstrap
 from stad_lab.frames import earlier_frames
 from stad_lab.mdn_rnn import MDNRNN, check_partner, encode_rollouts, fit_mdn_rnn, load_mdn_rnn
 from stad_lab.parallel import worker_processes
@@ -53,6 +53,7 @@ from stad_lab.quality import (
 )
 from stad_lab.rollouts import Rollouts, collect_rollouts, track_seeds
 from stad_lab.settings import Settings
+from stad_lab.training import training_device
 
 STRIDES = (1, 2, 4, 8)
 KL_WEIGHTS = (0.02, 0.08, 0.25, 1.0, 4.0, 16.0)
@@ -292,8 +293,8 @@ def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
     return {
         name: {
             "nats": float(found.mean()),
-            "interval": bootstrap_interval(found, DRIVE_RESAMPLES),
-            "more_than_M": bootstrap_interval(found - means["M"], DRIVE_RESAMPLES),
+            "interval": bootstrap(found[None], DRIVE_RESAMPLES),
+            "more_than_M": bootstrap((found - means["M"])[None], DRIVE_RESAMPLES),
         }
         for name, found in means.items()
     }
@@ -324,7 +325,7 @@ def lesser_forecasts(
         if not path.exists():
             encoded = encoded or encode_rollouts(world_model.autoencoder, rollouts, world_model.stride)
             torch.manual_seed(settings.seed)
-            mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures)
+            mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures).to(training_device())
             shown = [action * sees_actions for action in rollouts.actions]
             fit_mdn_rnn(path, mdn_rnn, "input", identity, encoded, shown, rollouts, lesser)
             save_json(path.with_name("record.json"), record)

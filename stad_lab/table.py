@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from stad_lab.checkpoints import load_json
-from stad_lab.evaluation import RESAMPLES, SOLVED, middle_95
-from stad_lab.evaluation import summarise as summarise_episodes
+from stad_lab.evaluation import RESAMPLES, SOLVED, bootstrap, draw_tracks, middle_95, resampled_means
+from stad_lab.evaluation import summarise as summarise_returns
 from stad_lab.evolution import LOG
 from stad_lab.pipeline import total_budget
 from stad_lab.rows import FLOORS, ROWS
@@ -141,8 +141,7 @@ def summarise(folders: list[Path]) -> dict:
     returns = official_returns(folders)
     budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
     return {
-        **summarise_episodes(returns.ravel()),
-        "interval": bootstrap(returns),
+        **summarise_returns(returns),
         "seeds": returns.mean(axis=1).tolist(),
         "worlds": len(worlds(folders)),
         "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
@@ -162,16 +161,6 @@ def official_returns(folders: list[Path]) -> np.ndarray:
     return np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
 
 
-def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
-    """95% interval of the mean of returns (seeds, tracks), by a bootstrap of the seeds and of the tracks.
-
-    All seeds drive the same tracks, so a track is drawn for all of them together. From three seeds the
-    interval may be too narrow (notebook 05, step 7). Agarwal et al., 2021, argue for bootstraps where runs are few.
-    """
-    means = resampled_means(returns, *draw_tracks(returns, resamples))
-    return middle_95(means)
-
-
 def bootstrap_gain(before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     """95% interval of the mean of `after` less the mean of `before`, both returns (seeds, tracks) on the same tracks.
 
@@ -181,15 +170,3 @@ def bootstrap_gain(before: np.ndarray, after: np.ndarray, resamples: int = RESAM
     rng, tracks = draw_tracks(before, resamples)
     gains = resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks)
     return middle_95(gains)
-
-
-def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generator, np.ndarray]:
-    """The Generator of a bootstrap, and the tracks of each resample, int (resamples, 1, tracks)."""
-    rng, tracks = np.random.default_rng(0), returns.shape[1]
-    return rng, rng.integers(tracks, size=(resamples, 1, tracks))
-
-
-def resampled_means(returns: np.ndarray, rng: np.random.Generator, tracks: np.ndarray) -> np.ndarray:
-    """The mean return of each resample, float64 (resamples,), with seeds drawn here."""
-    seeds = rng.integers(len(returns), size=(len(tracks), len(returns), 1))
-    return returns[seeds, tracks].mean(axis=(1, 2))

@@ -54,7 +54,7 @@ def fit(
         watch: called with the history so far, after the checkpoint of every entry and when a run is resumed.
 
     Returns:
-        The history: entries {"step", "train": means since the last entry, "heldout"}, a twentieth of the run apart.
+        The history: entries {"step", "train": means since the last entry, "heldout"}, `steps // 20` steps apart.
 
     Raises:
         ValueError: the checkpoint belongs to another training or is damaged.

@@ -157,7 +157,7 @@ def verify_evaluations(folder: Path) -> str:
 
 
 def drive_again(folder: Path, variant: str, settings: Settings, executor: Executor | None) -> str:
-    """Drive recorded episodes again: of an official evaluation, or of another, or of the last look at validation."""
+    """Drive recorded episodes again: of an evaluation, if there is one an official one, or of the look that chose C."""
     if not (folder / CONTROLLER).exists():
         return f"none: {NOT_HERE}"
     parameters, _ = load_controller(folder / CONTROLLER, variant)

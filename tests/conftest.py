@@ -47,11 +47,17 @@ def guard(event, arguments):
         forbid(f"{event} {arguments}")
     if event in ("socket.connect", "socket.bind") and not isinstance(arguments[1], str):  # a path: within the machine
         forbid(f"{event} {arguments}")
+    if event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate"):
+        for where in arguments:  # one path or two; a bare name lies in a folder that is open, of a tree that goes
+            if isinstance(where, str) and os.path.isabs(where):
+                check(where)
     if event == "open" and isinstance(arguments[0], str) and arguments[2] is not None:
-        where = os.path.abspath(arguments[0])
-        writes, allowed = arguments[2] & (os.O_WRONLY | os.O_RDWR), os.environ["GUARDED"].split(os.pathsep)
-        if writes and not where.startswith(tuple(allowed)):
-            forbid(f"writing to {where}")
+        if arguments[2] & (os.O_WRONLY | os.O_RDWR):
+            check(os.path.abspath(arguments[0]))
+
+def check(where):
+    if not where.startswith(tuple(os.environ["GUARDED"].split(os.pathsep))):
+        forbid(f"writing to {where}")
 
 def forbid(what):
     print("forbidden:", what, file=sys.stderr)
@@ -92,6 +98,7 @@ def train_quickly(folder, guard):
     # PyTorch looks for a place for temporary files: in /dev/ and /proc/, too
     may_write = os.pathsep.join([str(folder), str(guard), "/dev/", "/proc/"])
     guarded = {"GUARDED": may_write, "TMPDIR": str(guard), "PYTHONPATH": str(guard), "PYTHONDONTWRITEBYTECODE": "1"}
+    guarded["MPLCONFIGDIR"] = str(guard)  # matplotlib, which pycma imports, makes a folder for its own settings
     begin = time.perf_counter()
     process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded)
     told = {name: getattr(process, name) for name in ("returncode", "stdout", "stderr")}

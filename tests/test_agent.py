@@ -11,13 +11,25 @@ import numpy as np
 import pytest
 import torch
 
-from stad_lab import Agent, load_agent, make_env
-from stad_lab.agent import PRETRAINED, drive, load_controller, load_world_model, run_folder, save_controller
-from stad_lab.autoencoder import VARIANTS, AutoEncoder
+from stad_lab import Agent, load_agent, make_env, mdn_rnn
+from stad_lab.agent import (
+    PRETRAINED,
+    drive,
+    load_controller,
+    load_world_model,
+    read_world_model,
+    run_folder,
+    save_controller,
+)
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder
 from stad_lab.car_racing import FastCarRacing
-from stad_lab.controller import parameter_count
-from stad_lab.mdn_rnn import MDNRNN
-from stad_lab.pipeline import ship
+from stad_lab.controller import initial_parameters, parameter_count
+from stad_lab.frames import to_frame
+from stad_lab.mdn_rnn import MDNRNN, encode_frames
+from stad_lab.pipeline import ship, train
+from stad_lab.rollouts import Rollouts
+from stad_lab.search_space import features
+from stad_lab.settings import Settings
 
 
 def make_agent(variant="input_output", cars=None, stride=4, crop_bar=True):
@@ -227,6 +239,45 @@ def test_another_number_of_cars_is_refused(agent, observations):
         agent.act_batch(observations[:2])
 
 
+def test_a_first_step_that_is_refused_leaves_the_number_of_cars_open(agent, observations):
+    agent.reset()
+    with pytest.raises(ValueError, match="0 observations: expected at least 1"):
+        agent.act_batch([])
+    with pytest.raises(ValueError, match="expected uint8"):
+        agent.act(observations[0][:64])
+    assert agent.act_batch(observations[:3]).shape == (3, 3)
+
+
+def test_a_drive_without_a_frame_is_refused(agent):
+    with pytest.raises(ValueError, match="max_frames=0: expected at least 1"):
+        drive(agent, [0], max_frames=0)
+
+
+def test_the_stride_of_a_run_is_that_of_its_v_its_m_its_components_and_its_agent(
+    quick_run, observations, tmp_path, monkeypatch
+):
+    rollouts, given, weights = Rollouts(quick_run / "rollouts"), [], {}
+    fit = mdn_rnn.fit_mdn_rnn
+    monkeypatch.setattr(mdn_rnn, "fit_mdn_rnn", lambda *all: (given.append(all), fit(*all)))
+    for stride in (4, 2):
+        settings, run = Settings.preset("quick", stride=stride, v_steps=2, m_steps=1), tmp_path / str(stride)
+        train("input_output", settings, run, quick_run / "rollouts", until="mdn_rnn")
+        weights[stride] = load_autoencoder(run / "autoencoder.safetensors")[0].state_dict()
+    assert not all(torch.equal(weights[2][name], weights[4][name]) for name in weights[2])  # V saw other differences
+    world_model = read_world_model(run, "input_output")
+    path, first = run / "controller.safetensors", initial_parameters(32, 24)
+    save_controller(path, first, variant="input_output", **world_model.identities)
+    agent = load_agent("input_output", run)
+    *_, encoded, actions, _, _ = given[-1]
+    for episode, frames in enumerate(rollouts.frames):
+        seen = encode_frames(agent.autoencoder, frames, 2)
+        assert np.array_equal(encoded[episode], seen) and np.array_equal(actions[episode], rollouts.actions[episode])
+        assert np.array_equal(features(world_model, frames, actions[episode])[:, :32], seen[0])
+    act_along(agent, observations[:4])
+    frames = np.array([to_frame(observation, agent.crop_bar) for observation in observations[:4]])
+    assert np.allclose(agent.latents[0], encode_frames(agent.autoencoder, frames, 2)[0][-1], atol=1e-5)
+
+
 def test_a_number_of_cars_other_than_that_of_controllers_is_refused(observations):
     for count in (1, 2):
         with pytest.raises(ValueError, match=rf"\b{count} observations.*\b4 controllers"):
@@ -324,6 +375,9 @@ def test_a_damaged_run_is_not_shipped_and_one_without_c_leaves_none_of_before(qu
     (run / "controller.safetensors").write_bytes(b"cut short")
     with pytest.raises(ValueError, match=r"controller\.safetensors is damaged"):
         ship("input_output", run, tmp_path / "shipped")
+    assert {file.name: file.read_bytes() for file in target.iterdir()} == before
+    with pytest.raises(ValueError, match="is where agents are shipped to: give the folder of a run"):
+        ship("input_output", target, tmp_path / "shipped")
     assert {file.name: file.read_bytes() for file in target.iterdir()} == before
     (run / "controller.safetensors").unlink()
     (run / "evolution.json").unlink()

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from distributed import Client
+from distributed import Client, LocalCluster
 from test_faults import VARIANT, assert_equal_results, start_of
 
 from stad_lab import replication
@@ -157,6 +157,20 @@ def test_an_address_without_a_scheduler_is_an_error_that_says_how_to_start_one()
         pytest.raises(OSError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"),
         cluster("tcp://127.0.0.1:9", patience=1),
     ):
+        pass
+
+
+@pytest.mark.parametrize("address", ["127.0.0.1", "nonsense", "http://127.0.0.1:8787/status", "tls://127.0.0.1:9"])
+def test_what_is_no_address_of_a_scheduler_is_refused_before_a_client_is_made(address, monkeypatch):
+    monkeypatch.setattr("stad_lab.cluster.Client", None)
+    with pytest.raises(ValueError, match=rf"'{address}': expected the address that it prints"), cluster(address):
+        pass
+
+
+def test_a_scheduler_without_workers_is_an_error_that_says_how_to_start_one():
+    alone = LocalCluster(n_workers=0, processes=False, protocol="tcp://", dashboard_address=None)
+    message = "has no worker after 1 seconds: start one with `dask worker tcp://"
+    with alone, pytest.raises(OSError, match=message), cluster(alone.scheduler_address, patience=1):
         pass
 
 

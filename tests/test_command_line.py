@@ -3,9 +3,11 @@
 import dataclasses
 import importlib.metadata
 import json
+import re
 import shlex
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -196,6 +198,48 @@ def test_a_film_of_no_frame_is_refused_before_the_drive(agent):
         film_agent(agent, track=0, first=0, frames=10, every=0)
 
 
+@pytest.mark.parametrize(
+    ("does", "arguments", "given"),
+    [
+        (
+            "train",
+            "--variant input --settings quick --out run --rollouts shared --earlier first --until mdn_rnn",
+            ("input", Settings.preset("quick"), Path("run"), Path("shared"), "mdn_rnn", None, Path("first")),
+        ),
+        ("ship", "--variant frame --path run", ("frame", Path("run"))),
+        ("keep", "--row one_round --out table --seeds 1 2 --keep", ("one_round", Path("table"))),
+    ],
+)
+def test_every_option_of_a_command_reaches_what_it_is_for(does, arguments, given, monkeypatch, capsys):
+    told = []
+    monkeypatch.setattr(f"stad_lab.__main__.{does}", lambda *all, **named: told.append((all, named)) or ["here"])
+    command = "replicate" if does == "keep" else does
+    assert main([command, *arguments.split()]) == 0
+    assert told == [(given, {"seeds": [1, 2]} if does == "keep" else {})]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "train --variant input --settings quick --out run --set name=laptop",
+        "finish --variant input --out run --set earlier=x",
+    ],
+)
+def test_a_setting_that_is_none_to_change_ends_in_one_clear_line(command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert re.search("choose another preset|unknown setting 'earlier'", the_error(capsys, command.split()))
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_result_is_written_where_it_is_wanted_and_not_over_a_folder(run, tmp_path, capsys):
+    wanted = tmp_path / "made" / "result.json"
+    assert main([str(argument) for argument in [*evaluate_quickly(run), "--json", wanted]]) == 0
+    assert len(load_json(wanted)["episodes"]) == 1
+    capsys.readouterr()
+    error = the_error(capsys, [*evaluate_quickly(run), "--json", wanted.parent])
+    assert "is a folder: give the name of a file" in error
+
+
 def test_an_unknown_variant_ends_in_one_clear_line(tmp_path, command_line):
     process = command_line(*train_quickly(tmp_path / "run", variant="both"))  # as a user starts it
     assert process.returncode == 2
@@ -300,7 +344,7 @@ def test_v_of_another_size_ends_in_one_clear_line(run, capsys):
 def test_c_of_another_size_ends_in_one_clear_line(run, capsys):
     save_controller(run / "controller.safetensors", np.zeros(867), variant="input_output")
     error = the_error(capsys, evaluate_quickly(run))
-    assert "(867,), expected (195,)" in error
+    assert "(867,), expected (171,)" in error
     assert "belongs to a V or M of another size" in error
 
 
@@ -310,7 +354,7 @@ def test_training_on_top_of_weights_of_another_size_ends_in_one_clear_line(part,
         save_autoencoder(run / f"{part}.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
         (run / "mdn_rnn.safetensors").unlink()
     else:
-        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 32, 5), "input_output", PRESETS["quick"], [])
+        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 24, 5), "input_output", PRESETS["quick"], [])
     (run / "controller.safetensors").unlink()
     (run / "evolution.json").unlink()
     error = the_error(capsys, train_quickly(run))

@@ -159,3 +159,13 @@ def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent,
 def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
     with pytest.raises(ValueError, match="has not acted yet: let it drive a few real frames, then dream on"):
         dream_on(agent, 5)
+
+
+def test_an_agent_of_several_cars_cannot_dream_on(agent, observations):
+    agent.reset()
+    agent.act_batch(observations[:2])
+    with pytest.raises(ValueError, match=r"the agent drives 2 cars: expected one; choose it with agent\.keep"):
+        dream_on(agent, 5)
+    agent.keep(np.array([1]))
+    assert len(dream_on(agent, 2)[0]) == 2
+    agent.reset()

@@ -148,7 +148,7 @@ def test_the_controller_is_the_averaged_mean_that_drove_the_validation_tracks_be
     looks = {entry["generation"]: entry["validation"]["mean"] for entry in log["generations"] if "validation" in entry}
     assert list(looks) == [2, 4, 6]
     assert log["best"] == {"generation": max(looks, key=looks.get), "validation": max(looks.values())}
-    start = initial_parameters(32, 32, settings().initial_gas)
+    start = initial_parameters(32, 24, settings().initial_gas)
     _, means = replay(start, settings(), log["generations"][: log["best"]["generation"]])
     best = averaged_mean(means, settings())
     assert np.array_equal(load_controller(one_go / "controller.safetensors", "input_output")[0], best)
@@ -163,7 +163,7 @@ def test_the_first_of_two_equally_good_looks_is_kept():
 
 def test_an_agent_s_returns_are_those_of_its_own_drives_on_the_tracks_of_the_generation(quick_run):
     several = settings(tracks=2, max_frames=90)
-    population = np.array([initial_parameters(32, 32, gas=gas) for gas in (-3.0, -0.5, 0.5)])
+    population = np.array([initial_parameters(32, 24, gas=gas) for gas in (-3.0, -0.5, 0.5)])
     with ThreadPoolExecutor(1) as executor:
         entry = drive_generation(executor, quick_run, "input_output", several, [], population)
     for parameters, returns in zip(population, entry["returns"], strict=True):
@@ -174,7 +174,7 @@ def test_an_agent_s_returns_are_those_of_its_own_drives_on_the_tracks_of_the_gen
 
 
 def test_an_agent_that_gets_nowhere_is_given_up_in_a_generation_and_not_in_validation(quick_run):
-    impatient, braking = settings(patience=25, max_frames=80), initial_parameters(32, 32, gas=-9.0)
+    impatient, braking = settings(patience=25, max_frames=80), initial_parameters(32, 24, gas=-9.0)
     with ThreadPoolExecutor(1) as executor:
         entry = drive_generation(executor, quick_run, "input_output", impatient, [], np.tile(braking, (2, 1)))
         look = validate(executor, quick_run, "input_output", impatient, braking)

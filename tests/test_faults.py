@@ -527,6 +527,16 @@ def test_verify_tells_of_a_controller_that_the_log_does_not_know_beside_all_that
         assert "does not come from the run that" in found[part] and found[part].startswith("FAILED")
 
 
+@pytest.mark.parametrize(
+    ("name", "part"), [("autoencoder.safetensors", "V"), ("mdn_rnn.safetensors", "M"), ("rollouts", "V")]
+)
+def test_verify_tells_of_a_part_of_another_run_on_its_own_line(name, part, whole, another, tmp_path, in_this_process):
+    folder = shutil.copytree(whole, tmp_path / "run", ignore=shutil.ignore_patterns(name))
+    copy = shutil.copytree if name == "rollouts" else shutil.copy
+    copy(another / name, folder / name)
+    assert verify(folder, in_this_process)[part].startswith("FAILED")
+
+
 def test_verify_says_of_a_driver_without_an_agent_that_there_is_nothing_to_verify(capsys):
     assert main(["verify", str(RECORDS / "random_driver" / "seed0")]) == 2
     assert "random_driver, which has no V, M and C: there is nothing to verify" in capsys.readouterr().err

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from stad_lab.plots import STYLES, plot_bars, plot_curves, plot_intervals, plot_shares
+from stad_lab.plots import STYLES, plot_bars, plot_curves, plot_intervals, plot_mixture, plot_shares, plot_stacks
 
 
 def test_the_alternative_text_of_a_figure_tells_its_values():
@@ -22,3 +22,22 @@ def test_the_alternative_text_of_a_figure_tells_its_values():
 def test_lines_beside_each_other_differ_in_colour_and_in_their_dashes():
     assert len(set(STYLES)) == len(STYLES) == 24
     assert all(one[0] != other[0] and one[1] != other[1] for one, other in itertools.pairwise(STYLES[:6]))
+
+
+def test_the_density_of_a_mixture_holds_one_and_widens_with_the_temperature():
+    figure = plot_mixture(np.log([0.7, 0.3]), np.array([-1.0, 2.0]), np.log([0.5, 1.0]), [1.0, 4.0])
+    widths = []
+    for line in figure.axes[0].lines:
+        z, density = line.get_data()
+        assert abs(np.trapezoid(density, z) - 1) < 0.01
+        middle = np.trapezoid(z * density, z)
+        widths.append(np.trapezoid((z - middle) ** 2 * density, z))
+    weights = np.array([0.7, 0.3]) ** 0.25 / (np.array([0.7, 0.3]) ** 0.25).sum()  # as sample_mixture has it
+    spread = weights @ np.array([-1.0, 2.0]) ** 2 - (weights @ np.array([-1.0, 2.0])) ** 2
+    assert np.allclose(widths, [0.7 * 0.25 + 0.3 + 9 * 0.21, weights @ [1.0, 4.0] + spread], rtol=0.02)
+
+
+def test_every_part_of_a_stack_is_drawn():
+    stacks = {"one": dict.fromkeys("abcd", 1.0), "two": dict.fromkeys("abcd", 2.0)}
+    bars = plot_stacks(stacks, "T", "x").axes[0].patches
+    assert [bar.get_x() + bar.get_width() for bar in bars] == [1, 2, 3, 4, 2, 4, 6, 8]

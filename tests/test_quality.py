@@ -23,6 +23,7 @@ from stad_lab.quality import (
     redraw,
     region_masks,
     repeat_forecast,
+    single_step_nll,
 )
 from stad_lab.settings import Settings
 
@@ -108,6 +109,15 @@ def test_m_s_nll_is_its_loss_and_frame_by_frame():
     nll = mixture_nll(mixture, z)
     assert nll.shape == (30, 19, 4)
     assert nll.mean() == pytest.approx(mdn_loss(mixture, torch.from_numpy(z[:, 1:])).item(), rel=1e-5)
+
+
+def test_a_single_step_is_judged_as_a_drive_of_two_frames():
+    mdn_rnn, (z, actions) = make_mdn_rnn(), latents_and_actions(drives=3, length=6)
+    found = single_step_nll(mdn_rnn, z, actions)
+    assert found.shape == (3, 5, 4)
+    for t in range(5):
+        pair, done = z[:, t : t + 2], actions[:, t : t + 2]
+        assert np.allclose(found[:, t], mixture_nll(forecast(mdn_rnn, pair, done), pair)[:, 0], atol=1e-5)
 
 
 @pytest.mark.parametrize(("spread", "shape"), [(1.0, "uniform"), (2.0, "edges"), (0.5, "middle")])

@@ -13,6 +13,7 @@ from scipy.stats import f, t, ttest_ind
 from stad_lab import make_env
 from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
+from stad_lab.benchmark import project
 from stad_lab.checkpoints import load_json
 from stad_lab.evolution import LOG
 from stad_lab.plots import plot_claims
@@ -164,6 +165,9 @@ def test_the_cluster_page_says_what_the_record_says():
     for name, value in result["frames a second, a generation"].items():
         assert cells(name, CLUSTER) == [f"{value['median']:,.0f}", f"{value['ratio']:.2f}"]
     costs, efficiency = result["costs"], result["projected efficiency, 1,024 episodes of 1,000 frames"]
+    assert project(costs, 1) == 1
+    for workers, told in efficiency.items():
+        assert project(costs, int(workers.removesuffix(" workers").replace(",", ""))) == pytest.approx(told)
     for number in (
         f"{costs['frames a second, 16 in step']:.0f}",
         f"{costs['frames a second, 1 car in a process']:.0f}",

@@ -204,7 +204,7 @@ def test_the_last_twentieth_of_the_episodes_is_held_out():
     assert training.tolist() == list(range(38 * 3)) and heldout.tolist() == list(range(38 * 3, 40 * 3))
 
 
-def test_the_four_uses_share_no_track():
+def test_the_five_uses_share_no_track():
     ranges = sorted(TRACK_RANGES.values())
     assert all(before[1] <= after[0] for before, after in itertools.pairwise(ranges))
     for use, (low, high) in TRACK_RANGES.items():
@@ -246,6 +246,14 @@ def test_a_block_cut_short_is_an_error_that_names_it(copied):
         ValueError, match=r"00002.frames.npy is damaged \(5000 bytes.*checksum.*delete .* collect again"
     ):
         Rollouts(copied)
+
+
+def test_a_file_cut_short_after_it_was_found_whole_gives_no_pictures(copied):
+    rollouts = Rollouts(copied)
+    path = sorted(copied.glob("*.frames.npy"))[-1]
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(ValueError, match=r"frames\.npy is shorter than it was: collect in another folder"):
+        rollouts.pairs(np.array([len(rollouts) - 1]), 4)
 
 
 def test_one_flipped_bit_is_an_error_that_names_the_block(copied):

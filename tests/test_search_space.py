@@ -57,8 +57,8 @@ def test_what_c_may_not_see_has_no_weight(quick_run, sees, columns):
     assert (np.delete(components, columns, axis=1) == 0).all()
     space = search_space(Settings.preset("quick", features=sees), read_world_model(quick_run, VARIANT), quick_run)
     whole = space.expand(np.ones(len(space.first)))
-    weights = whole[:-3].reshape(3, 64)
-    hidden = {"z": slice(32, 64), "h": slice(32), "z, h": slice(0)}[sees]
+    weights = whole[:-3].reshape(3, 56)
+    hidden = {"z": slice(32, 56), "h": slice(32), "z, h": slice(0)}[sees]
     assert (
         (weights[:, hidden] == 0).all() and (np.delete(weights, hidden, axis=1) == 1).all() and (whole[-3:] == 1).all()
     )
@@ -70,7 +70,7 @@ def test_a_c_of_the_components_does_what_its_weights_say(searched, quick_run):
     rollouts = Rollouts(quick_run / "rollouts")
     drives = zip(rollouts.frames, rollouts.actions, strict=True)
     seen = np.concatenate([features(world_model, *drive) for drive in drives])
-    middle, components = principal_components([seen], np.ones(64, bool), 5)
+    middle, components = principal_components([seen], np.ones(56, bool), 5)
     found = np.random.default_rng(0).standard_normal(3 * 5 + 3)
     raw = (seen - middle) @ components.T @ found[:15].reshape(3, 5).T + found[15:] + [0, SETTINGS.initial_gas, 0]
     steering = control(space.expand(found), seen)[:, 0]

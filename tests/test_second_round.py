@@ -207,7 +207,7 @@ def test_a_shipped_second_round_lies_beside_the_first_and_can_be_verified(second
     assert ship(VARIANT, quick_run, tmp_path) == tmp_path / VARIANT
     shipped = ship(VARIANT, second, tmp_path)
     assert shipped == tmp_path / "second_round" / VARIANT
-    assert load_agent(VARIANT, shipped).parameters.size == 3 * 64 + 3
+    assert load_agent(VARIANT, shipped).parameters.size == 3 * 56 + 3
     found = verify(shipped)
     assert found["log of CMA-ES"] == "ok: 4 generations lead to the same mean" and found["C"].startswith("ok")
 

@@ -58,6 +58,11 @@ def test_an_unknown_preset_is_refused_with_the_choices():
         Settings.preset("fast")
 
 
+def test_a_preset_keeps_its_name():
+    with pytest.raises(ValueError, match="name='laptop' of the settings 'quick': choose another preset instead"):
+        Settings.preset("quick", name="laptop")
+
+
 @pytest.mark.parametrize("make", [lambda: Settings.preset("quick", strid=2), lambda: Settings.from_dict({"strid": 2})])
 def test_an_unknown_field_is_refused_with_the_choices(make):
     with pytest.raises(ValueError, match=r"unknown setting 'strid': the settings are name, seed, .*stride"):
@@ -75,6 +80,7 @@ def test_an_unknown_field_is_refused_with_the_choices(make):
         ("sigma", 0.0, "expected 1e-12 to"),
         ("sigma", "big", "expected float"),
         ("kl_weight", -0.1, "expected 0 to"),
+        ("kl_weight", 10**400, "expected 0 to"),
         ("kl_weight", float("nan"), "expected 0 to"),
         ("initial_gas", float("nan"), "expected"),
         ("v_learning_rate", float("inf"), "expected 1e-12 to"),

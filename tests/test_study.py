@@ -23,6 +23,7 @@ from stad_lab.study import (
     lesser_forecasts,
     probe_drives,
     probe_panels,
+    simple_forecasts,
     study,
 )
 
@@ -64,6 +65,8 @@ def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_
     assert list(measured.glob("no_memory/*.training.safetensors"))
     again = lesser_forecasts(*arguments)
     assert all(np.array_equal(first[name], again[name]) for name in CONTENDERS)
+    otherwise = lesser_forecasts(*arguments[:-1], 1 - actions)
+    assert [name for name in CONTENDERS if np.array_equal(first[name], otherwise[name])] == ["no actions"]
     assert (measured / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns == kept
     assert not list(measured.glob("*/*.training.safetensors"))
 
@@ -121,6 +124,25 @@ def test_drives_are_probed_for_every_motion_and_shown_by_motion():
     assert list(found) == ["z"] and set(found["z"]) == set(MOTION)
     panels = probe_panels({"untrained": found})
     assert panels["yaw rate"]["untrained"]["z"][0] == found["z"]["yaw rate"]["r2"]
+
+
+def test_the_first_frames_of_a_drive_do_not_count_in_a_probe():
+    settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
+    drives = [record_random_drive(settings, index) for index in range(12)]
+    asked = (8, AutoEncoder("input_output", width=4), {}, settings.stride, settings.crop_bar)
+    found = probe_drives(drives, *asked)
+    for drive in drives:
+        drive.motion[:8, list(MOTION).index("yaw rate")] = 1e3
+    assert probe_drives(drives, *asked) == found
+
+
+def test_simple_forecasts_are_fitted_on_the_first_half_of_the_drives_alone():
+    rng = np.random.default_rng(0)
+    z, actions = rng.standard_normal((6, 20, 4), np.float32), rng.random((6, 20, 3), np.float32)
+    found = simple_forecasts(z, actions)
+    z[3:] *= 10
+    for name, nll in simple_forecasts(z, actions).items():
+        assert np.array_equal(nll[:3], found[name][:3]) and not np.allclose(nll[3:], found[name][3:])
 
 
 def test_forecasts_are_compared_on_the_same_frames_and_on_active_latents():
