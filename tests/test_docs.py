@@ -5,16 +5,20 @@ outputs, and runs one small notebook in their place: what it does not see is onl
 site is built from the notebooks as they ran, with one command and under the same check.
 """
 
+import io
 import json
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
+import gallery  # noqa: E402
 from site_check import faults  # noqa: E402
 
 CELLS = (
@@ -44,6 +48,28 @@ def site(tmp_path_factory):
     )
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", source, out]
     return out, subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+
+
+def test_the_readme_s_gallery_shows_figures_of_cells_that_there_are():
+    readme, cells = (ROOT / "README.md").read_text(), set()
+    for notebook in (ROOT / "notebooks").glob("0*.ipynb"):
+        cells |= {cell["id"] for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"}
+    pictures = {file.stem: file for file in (ROOT / "notebooks" / "pictures").glob("0*.png")}
+    assert set(gallery.CELLS) == set(pictures) <= cells
+    for cell, file in pictures.items():
+        (alternative,) = re.findall(rf"!\[([^\]]+)\]\(notebooks/pictures/{cell}\.png\)", readme)
+        assert Image.open(file).text["Description"].startswith(alternative)
+
+
+def test_the_figure_of_a_cell_is_what_a_reader_of_the_notebook_sees(tmp_path, monkeypatch):
+    cells = [
+        {"id": "7-2", "cell_type": "code", "metadata": {}, "source": CELLS[0], "outputs": [], "execution_count": None}
+    ]
+    notebook = {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
+    (tmp_path / "7-_small.ipynb").write_text(json.dumps(notebook))
+    monkeypatch.setattr(gallery, "NOTEBOOKS", tmp_path)
+    picture = Image.open(io.BytesIO(gallery.figure_of("7-2")))
+    assert picture.size == (100, 100) and picture.text["Description"] == "an empty square"
 
 
 def test_the_site_builds_without_a_warning(site):

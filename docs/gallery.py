@@ -1,0 +1,33 @@
+"""Draw the gallery of the README again, some figures of the notebooks: python docs/gallery.py
+
+A committed notebook has no outputs, so whoever reads on a code host would see no figure of it at all. Each picture
+is named by the cell that shows it, and holds its alternative text.
+"""
+
+import base64
+import re
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+CELLS = ("00-11", "01-16", "02-17", "02-34", "03-31", "04-08")
+
+
+def figure_of(cell: str) -> bytes:
+    """The PNG that a cell of a notebook shows, when the notebook has run from its first cell to this one."""
+    (notebook,) = NOTEBOOKS.glob(f"{cell[:2]}_*.ipynb")
+    ran = nbformat.read(notebook, as_version=4)
+    last = [one["id"] for one in ran.cells].index(cell)
+    ran.cells = ran.cells[: last + 1]
+    NotebookClient(ran, timeout=600, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()
+    shown = "".join(output["data"].get("text/html", "") for output in ran.cells[-1].outputs if "data" in output)
+    return base64.b64decode(re.search(r"data:image/png;base64,([^\"]+)", shown).group(1))
+
+
+if __name__ == "__main__":
+    for cell in CELLS:
+        picture = NOTEBOOKS / "pictures" / f"{cell}.png"
+        picture.write_bytes(figure_of(cell))
+        print(picture)
