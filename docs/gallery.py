@@ -5,6 +5,7 @@ is named by the cell that shows it, and holds its alternative text.
 """
 
 import base64
+import os
 import re
 from pathlib import Path
 
@@ -27,6 +28,7 @@ def figure_of(cell: str) -> bytes:
 
 
 if __name__ == "__main__":
+    os.environ["STAD_LAB_SETTINGS"] = "laptop"  # the kernels inherit it
     for cell in CELLS:
         picture = NOTEBOOKS / "pictures" / f"{cell}.png"
         picture.write_bytes(figure_of(cell))

@@ -343,7 +343,9 @@ def do_table(options: argparse.Namespace) -> None:
     if options.picture:
         from stad_lab.plots import plot_claims, to_png  # matplotlib takes a second, and workers import this file
 
-        write_bytes(options.picture, to_png(plot_claims(claims_and_outcomes(rows))))
+        figure = plot_claims(claims_and_outcomes(rows))
+        write_bytes(options.picture, to_png(figure))
+        print(f"drawn to {options.picture}: {figure.get_label()}")
 
 
 def add_study(commands: argparse._SubParsersAction) -> None:

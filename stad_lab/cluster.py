@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from distributed import Client, Future
+from distributed import Client, Future, Security
 from distributed.cfexecutor import ClientExecutor
 from distributed.comm import get_address_host_port, parse_address
 
@@ -62,7 +62,7 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
     check_address(address)
     try:
         client = Client(address, timeout=patience, set_as_default=False)
-    except (OSError, TimeoutError) as error:
+    except OSError as error:
         raise ConnectionError(
             f"no Dask scheduler answers at {address!r} ({error}): start one with `dask scheduler`, and give the address"
             " that it prints"
@@ -85,14 +85,17 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
 
 
 def check_address(address: str) -> None:
-    """Raise ValueError unless an address is one of TCP; a Client that is given another leaves a process that hangs."""
+    """Raise ValueError unless a Client can try an address: given another, it leaves a process that hangs."""
     try:
         get_address_host_port(address)
-        known = parse_address(address)[0] == "tcp"
+        scheme = parse_address(address)[0]
     except ValueError:
-        known = False
-    if not known:
-        raise ValueError(f"scheduler {address!r}: expected the address that it prints, such as tcp://10.0.0.1:8786")
+        scheme = "unknown"
+    if scheme != "tcp" and not (scheme == "tls" and Security().get_connection_args("client").get("ssl_context")):
+        raise ValueError(
+            f"scheduler {address!r}: expected the address that it prints, such as tcp://10.0.0.1:8786 (one with tls://"
+            " needs certificates in Dask's configuration)"
+        )
 
 
 def versions() -> dict[str, str]:

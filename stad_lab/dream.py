@@ -139,14 +139,15 @@ def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0)
     if agent.state is None:
         raise ValueError("the agent has not acted yet: let it drive a few real frames, then dream on")
     if len(agent.cars) != 1:
-        raise ValueError(f"the agent drives {len(agent.cars)} cars: expected one; choose it with agent.keep")
+        raise ValueError(f"the agent drives {len(agent.cars)} cars: expected one, so call agent.reset() and drive one")
     expected = agent.mdn_rnn.mixture(agent.state[0].transpose(0, 1))
     latents = sample_mixture(expected, temperature, torch.Generator().manual_seed(seed))[0, 0].numpy()
     env = DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature, frames, render_mode="rgb_array")
     latents, info = env.reset(seed=seed, options={"latents": latents, "state": agent.state})
+    parameters = agent.parameters[agent.cars] if agent.parameters.ndim == 2 else agent.parameters
     pictures, actions = [], []
     for _ in range(frames):
         pictures.append(env.render())
-        actions.append(control(agent.parameters, np.concatenate([latents, info["hidden"]])[None])[0])
+        actions.append(control(parameters, np.concatenate([latents, info["hidden"]])[None])[0])
         latents, _, _, _, info = env.step(actions[-1])
     return np.array(pictures), np.array(actions)

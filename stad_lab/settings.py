@@ -133,8 +133,8 @@ class Settings:
         """Look up a preset by name.
 
         Args:
-            name: "quick", "laptop" or "paper"; None reads the environment variable STAD_LAB_SETTINGS, and takes
-                "laptop" if that is not set.
+            name: "quick", "laptop" or "paper", by its place; None reads the environment variable STAD_LAB_SETTINGS,
+                and takes "laptop" if that is not set.
             **changes: fields to set differently, for example `stride=2`; all but the name.
 
         Raises:
@@ -144,7 +144,10 @@ class Settings:
         if name not in PRESETS:
             raise ValueError(f"unknown settings {name!r}: choose one of {', '.join(PRESETS)}")
         if changes.get("name", name) != name:
-            raise ValueError(f"name={changes['name']!r} of the settings {name!r}: choose another preset instead")
+            raise ValueError(
+                f"name={changes['name']!r} of the settings {name!r}: give the preset itself, Settings.preset('quick')"
+                " or --settings quick"
+            )
         return dataclasses.replace(PRESETS[name], **known_fields(changes))
 
     def as_dict(self) -> dict:

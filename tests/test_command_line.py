@@ -110,6 +110,7 @@ def test_a_budget_that_a_kill_left_behind_is_counted_again_and_a_later_start_by_
         ("evaluate", ["--variant", "--path", "--episodes", "--first-track", "--fast", "--processes", "--json"]),
         ("benchmark", ["--part", "--rounds", "--json", "parity", "renderer", "loop", "training"]),
         ("ship", ["--variant", "--path"]),
+        ("table", ["--records", "--picture"]),
         ("film", ["--variant", "--path", "--out", "--track", "--first", "--frames", "--viewer"]),
         ("study", ["--settings", "--out", "--rollouts", "--part", "probe", "autoencoder", "mdn_rnn"]),
     ],
@@ -227,7 +228,7 @@ def test_every_option_of_a_command_reaches_what_it_is_for(does, arguments, given
 )
 def test_a_setting_that_is_none_to_change_ends_in_one_clear_line(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert re.search("choose another preset|unknown setting 'earlier'", the_error(capsys, command.split()))
+    assert re.search("give the preset itself|unknown setting 'earlier'", the_error(capsys, command.split()))
     assert not any(tmp_path.iterdir())
 
 

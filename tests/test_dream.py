@@ -7,6 +7,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
+from stad_lab.agent import Agent
 from stad_lab.controller import control
 from stad_lab.dream import DreamEnv, dream_on
 
@@ -161,11 +162,14 @@ def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
         dream_on(agent, 5)
 
 
-def test_an_agent_of_several_cars_cannot_dream_on(agent, observations):
-    agent.reset()
-    agent.act_batch(observations[:2])
-    with pytest.raises(ValueError, match=r"the agent drives 2 cars: expected one; choose it with agent\.keep"):
-        dream_on(agent, 5)
-    agent.keep(np.array([1]))
-    assert len(dream_on(agent, 2)[0]) == 2
-    agent.reset()
+def test_one_car_dreams_on_with_its_own_c_and_several_cannot(agent, observations):
+    rows = np.stack([agent.parameters, -agent.parameters])
+    many, alone = (Agent(agent.autoencoder, agent.mdn_rnn, c, agent.stride, agent.crop_bar) for c in (rows, rows[1]))
+    many.act_batch(observations[:2])
+    with pytest.raises(ValueError, match=r"drives 2 cars: expected one, so call agent\.reset\(\) and drive one"):
+        dream_on(many, 5)
+    many.keep(np.array([1]))
+    alone.act(observations[1])
+    assert np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-4)
+    alone.parameters = rows[0]
+    assert not np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-2)

@@ -315,7 +315,8 @@ def test_the_command_prints_the_finished_seeds_of_rows_anywhere_and_draws_them_b
     picture = tmp_path / "claims.png"
     assert main(["table", "--records", str(records), "--picture", str(picture)]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == 3 and lines[2].startswith(f"| `two` | 1 of 2 | 1 | {table[1]['two']['seeds'][0]:.1f} |")
+    assert len(lines) == 4 and lines[3].startswith(f"drawn to {picture}: Claimed and found")
+    assert lines[2].startswith(f"| `two` | 1 of 2 | 1 | {table[1]['two']['seeds'][0]:.1f} |")
     assert "input_output the paper, v0 902." in Image.open(picture).text["Description"]
 
 

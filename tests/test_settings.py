@@ -59,7 +59,7 @@ def test_an_unknown_preset_is_refused_with_the_choices():
 
 
 def test_a_preset_keeps_its_name():
-    with pytest.raises(ValueError, match="name='laptop' of the settings 'quick': choose another preset instead"):
+    with pytest.raises(ValueError, match="name='laptop' of the settings 'quick': give the preset itself, Settings"):
         Settings.preset("quick", name="laptop")
 
 
