@@ -91,7 +91,11 @@ def check_address(address: str) -> None:
         scheme = parse_address(address)[0]
     except ValueError:
         scheme = "unknown"
-    if scheme != "tcp" and not (scheme == "tls" and Security().get_connection_args("client").get("ssl_context")):
+    try:
+        certified = scheme == "tls" and Security().get_connection_args("client").get("ssl_context")
+    except OSError as error:
+        raise ValueError(f"scheduler {address!r}: Dask's certificates cannot be read ({error})") from error
+    if scheme != "tcp" and not certified:
         raise ValueError(
             f"scheduler {address!r}: expected the address that it prints, such as tcp://10.0.0.1:8786 (one with tls://"
             " needs certificates in Dask's configuration)"

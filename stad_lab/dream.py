@@ -139,7 +139,9 @@ def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0)
     if agent.state is None:
         raise ValueError("the agent has not acted yet: let it drive a few real frames, then dream on")
     if len(agent.cars) != 1:
-        raise ValueError(f"the agent drives {len(agent.cars)} cars: expected one, so call agent.reset() and drive one")
+        raise ValueError(
+            f"the agent drives {len(agent.cars)} cars: expected one, so go on with agent.keep(np.array([0]))"
+        )
     expected = agent.mdn_rnn.mixture(agent.state[0].transpose(0, 1))
     latents = sample_mixture(expected, temperature, torch.Generator().manual_seed(seed))[0, 0].numpy()
     env = DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature, frames, render_mode="rgb_array")

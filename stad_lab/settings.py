@@ -145,8 +145,8 @@ class Settings:
             raise ValueError(f"unknown settings {name!r}: choose one of {', '.join(PRESETS)}")
         if changes.get("name", name) != name:
             raise ValueError(
-                f"name={changes['name']!r} of the settings {name!r}: give the preset itself, Settings.preset('quick')"
-                " or --settings quick"
+                f"name={changes['name']!r} of the settings {name!r}: the name cannot be set; choose a preset with"
+                f" Settings.preset(NAME) or --settings NAME ({', '.join(PRESETS)})"
             )
         return dataclasses.replace(PRESETS[name], **known_fields(changes))
 

@@ -17,7 +17,7 @@ from test_faults import VARIANT, assert_equal_results, start_of
 from stad_lab import replication
 from stad_lab.__main__ import main
 from stad_lab.checkpoints import load_json
-from stad_lab.cluster import check_versions, cluster, versions
+from stad_lab.cluster import check_address, check_versions, cluster, versions
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import evolve
 from stad_lab.rollouts import collect_rollouts
@@ -165,6 +165,15 @@ def test_what_is_no_address_of_a_scheduler_is_refused_before_a_client_is_made(ad
     monkeypatch.setattr("stad_lab.cluster.Client", None)
     with pytest.raises(ValueError, match=rf"'{address}': expected the address that it prints"), cluster(address):
         pass
+
+
+def test_a_tls_address_may_be_tried_with_certificates(monkeypatch):
+    found = {"ssl_context": object()}
+    monkeypatch.setattr("stad_lab.cluster.Security.get_connection_args", lambda *given: found)
+    check_address("tls://127.0.0.1:9")
+    found.clear()
+    with pytest.raises(ValueError, match="needs certificates"):
+        check_address("tls://127.0.0.1:9")
 
 
 def test_a_scheduler_without_workers_is_an_error_that_says_how_to_start_one():

@@ -228,7 +228,9 @@ def test_every_option_of_a_command_reaches_what_it_is_for(does, arguments, given
 )
 def test_a_setting_that_is_none_to_change_ends_in_one_clear_line(command, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    assert re.search("give the preset itself|unknown setting 'earlier'", the_error(capsys, command.split()))
+    assert re.search(
+        "the name cannot be set; choose a preset|unknown setting 'earlier'", the_error(capsys, command.split())
+    )
     assert not any(tmp_path.iterdir())
 
 

@@ -166,7 +166,7 @@ def test_one_car_dreams_on_with_its_own_c_and_several_cannot(agent, observations
     rows = np.stack([agent.parameters, -agent.parameters])
     many, alone = (Agent(agent.autoencoder, agent.mdn_rnn, c, agent.stride, agent.crop_bar) for c in (rows, rows[1]))
     many.act_batch(observations[:2])
-    with pytest.raises(ValueError, match=r"drives 2 cars: expected one, so call agent\.reset\(\) and drive one"):
+    with pytest.raises(ValueError, match=r"drives 2 cars: expected one, so go on with agent\.keep"):
         dream_on(many, 5)
     many.keep(np.array([1]))
     alone.act(observations[1])

@@ -300,7 +300,9 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert f"({np.mean(means[2:4]) - means[0]:.0f} on average, {low:.0f} to {high:.0f}, without" in RESULTS
     low, high = bootstrap_gain(returns["paper_frame"], returns["paper_input_output"])
     assert f"that of `paper_input_output` {means[4] - means[0]:.0f} ({low:.0f} to {high:.0f}, again" in RESULTS
-    assert [round(mean) for mean in (means[0], min(means[1:]), max(means[1:]))] == [462, 637, 734]  # README
+    leads = [mean - means[0] for mean in means[1:]]
+    told = f"have {min(means[1:]):.0f} to {max(means[1:]):.0f} and `frame` has {means[0]:.0f}: "
+    assert told + f"{min(leads):.0f} to {max(leads):.0f} points behind" in README
     assert min(means[1:]) - means[0] > np.ptp(means[2:4])  # so by the letter of the rule the claim holds, so far
     _, average, best = fitness_curves(load_json(theirs[4] / LOG)["generations"])
     assert (round(means[4]), round(best.max()), round(average.max())) == (730, 937, 918)

@@ -59,7 +59,9 @@ def test_an_unknown_preset_is_refused_with_the_choices():
 
 
 def test_a_preset_keeps_its_name():
-    with pytest.raises(ValueError, match="name='laptop' of the settings 'quick': give the preset itself, Settings"):
+    with pytest.raises(
+        ValueError, match="name='laptop' of the settings 'quick': the name cannot be set; choose a preset with"
+    ):
         Settings.preset("quick", name="laptop")
 
 
