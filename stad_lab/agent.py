@@ -69,14 +69,14 @@ class Agent:
         """
         self._check_count(len(observations))
         frames = np.stack([to_frame(observation, self.crop_bar) for observation in observations])
-        self.cars = np.arange(len(frames)) if self.cars is None else self.cars
+        if self.cars is None:
+            self.cars = np.arange(len(frames))
         frame, difference = to_pictures(frames, self.memory.push(frames))
         latents, _ = self.autoencoder.encode(frame, difference)
         if self.state is None:
             self.state = tuple(torch.zeros(1, len(frames), self.mdn_rnn.hidden_size) for _ in range(2))
         self.latents, self.hidden = latents.numpy(), self.state[0][0].numpy()
-        parameters = self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
-        actions = control(parameters, np.concatenate([self.latents, self.hidden], axis=1))
+        actions = control(self.present_parameters(), np.concatenate([self.latents, self.hidden], axis=1))
         self.take_in(actions, self.state)
         return actions
 
@@ -91,6 +91,10 @@ class Agent:
         """
         seen, done = torch.from_numpy(self.latents)[:, None], torch.from_numpy(actions)[:, None]
         _, self.state = self.mdn_rnn.remember(seen, done, before)
+
+    def present_parameters(self) -> np.ndarray:
+        """C's parameters for the present cars: one vector for all, or a row for each."""
+        return self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
 
     def keep(self, cars: np.ndarray) -> None:
         """Go on with some of the cars only, until the next reset: `cars` are their indices among the present ones."""

@@ -146,8 +146,7 @@ def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0)
     latents = sample_mixture(expected, temperature, torch.Generator().manual_seed(seed))[0, 0].numpy()
     env = DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature, frames, render_mode="rgb_array")
     latents, info = env.reset(seed=seed, options={"latents": latents, "state": agent.state})
-    parameters = agent.parameters[agent.cars] if agent.parameters.ndim == 2 else agent.parameters
-    pictures, actions = [], []
+    parameters, pictures, actions = agent.present_parameters(), [], []
     for _ in range(frames):
         pictures.append(env.render())
         actions.append(control(parameters, np.concatenate([latents, info["hidden"]])[None])[0])

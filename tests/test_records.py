@@ -15,13 +15,13 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.autoencoder import VARIANTS
 from stad_lab.benchmark import project
 from stad_lab.checkpoints import load_json
+from stad_lab.evaluation import bootstrap
 from stad_lab.evolution import LOG, fitness_curves
 from stad_lab.plots import plot_claims
 from stad_lab.rows import ABLATIONS, ROWS
 from stad_lab.settings import Settings
 from stad_lab.table import (
     RECIPES,
-    bootstrap,
     bootstrap_gain,
     claims_and_outcomes,
     describe_table,

@@ -11,7 +11,7 @@ from PIL import Image
 from stad_lab import replication
 from stad_lab.__main__ import main
 from stad_lab.checkpoints import checksum, load_json, save_json
-from stad_lab.evaluation import evaluate
+from stad_lab.evaluation import bootstrap, evaluate
 from stad_lab.evolution import LOG, fitness_curves
 from stad_lab.pipeline import starts, total_budget
 from stad_lab.plots import plot_curves, plot_episodes, plot_intervals, plot_returns, plot_seeds, plot_stacks
@@ -20,7 +20,6 @@ from stad_lab.rows import FLOORS, ROWS, Row
 from stad_lab.settings import Settings
 from stad_lab.table import (
     WORLD_MODELS,
-    bootstrap,
     bootstrap_gain,
     kept_rows,
     learning_curve,

@@ -27,6 +27,13 @@ from stad_lab.study import (
     study,
 )
 
+SETTINGS = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
+
+
+def twelve_drives():
+    """Drives of the random driver, recorded anew, since a test may change them."""
+    return [record_random_drive(SETTINGS, index) for index in range(12)]
+
 
 @pytest.fixture(scope="module")
 def measured(quick_run, tmp_path_factory):
@@ -72,8 +79,7 @@ def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_
 
 
 def test_every_stride_and_weight_of_the_kl_is_trained_and_measured(quick_run, tmp_path, monkeypatch):
-    settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
-    drives = [record_random_drive(settings, index) for index in range(12)]
+    drives = twelve_drives()
     monkeypatch.setattr("stad_lab.study.random_drives", lambda *given: drives)
     monkeypatch.setattr("stad_lab.study.agent_drives", lambda *given: drives)
     monkeypatch.setattr("stad_lab.study.AGENT_SKIP", 8)
@@ -118,18 +124,16 @@ def test_an_unknown_part_is_refused_before_any_work(tmp_path):
 
 
 def test_drives_are_probed_for_every_motion_and_shown_by_motion():
-    settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
-    drives = [record_random_drive(settings, index) for index in range(12)]
-    found = probe_drives(drives, 8, AutoEncoder("input_output", width=4), {}, settings.stride, settings.crop_bar)
+    drives = twelve_drives()
+    found = probe_drives(drives, 8, AutoEncoder("input_output", width=4), {}, SETTINGS.stride, SETTINGS.crop_bar)
     assert list(found) == ["z"] and set(found["z"]) == set(MOTION)
     panels = probe_panels({"untrained": found})
     assert panels["yaw rate"]["untrained"]["z"][0] == found["z"]["yaw rate"]["r2"]
 
 
 def test_the_first_frames_of_a_drive_do_not_count_in_a_probe():
-    settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
-    drives = [record_random_drive(settings, index) for index in range(12)]
-    asked = (8, AutoEncoder("input_output", width=4), {}, settings.stride, settings.crop_bar)
+    drives = twelve_drives()
+    asked = (8, AutoEncoder("input_output", width=4), {}, SETTINGS.stride, SETTINGS.crop_bar)
     found = probe_drives(drives, *asked)
     for drive in drives:
         drive.motion[:8, list(MOTION).index("yaw rate")] = 1e3
