@@ -3,6 +3,7 @@
 import itertools
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ from stad_lab.table import (
     RECIPES,
     bootstrap_gain,
     claims_and_outcomes,
-    describe_table,
     kept_rows,
     learning_curve,
     lost_points,
@@ -33,6 +33,9 @@ from stad_lab.table import (
     summarise,
     worlds,
 )
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
+import tables
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
 README = (Path(__file__).parent.parent / "README.md").read_text()
@@ -198,7 +201,6 @@ def test_the_readme_s_rows_are_the_replication_s():
         counts = [f"{found['agents']:,.0f}", f"{found['episodes']:,.0f}", f"{found['frames'] / 1e6:.2f} M"]
         scores = [f"{found['mean']:.1f}", f"{low:.1f} to {high:.1f}", f"{100 * found['above_900']:.0f}%"]
         assert cells(f"`{name}`") == [seeds, f"{found['worlds']}", *scores, *counts]
-    assert describe_table(kept) in README  # what the command prints
     assert f"Not made yet: {', '.join(f'`{name}`' for name in ROWS if name not in kept)}." in README
 
 
@@ -217,35 +219,19 @@ def test_the_scores_that_were_known_when_the_recipe_changed_are_those_of_the_row
         assert f"{summarise(kept_rows()[name])['mean']:.1f}" in page
 
 
-def test_the_results_tell_how_the_drives_of_a_row_spread():
-    for name, folders in kept_rows().items():
-        returns, found = official_returns(folders), summarise(folders)
-        failed = f"{(returns < 800).sum()} of {returns.size}"
-        told = [f"{found['standard_deviation']:.0f}", f"{np.median(returns):.1f}", failed, f"{found['top_90']:.1f}"]
-        assert cells(f"`{name}`", RESULTS) == told
+def test_the_tables_of_the_pages_are_those_that_the_records_give():
+    for page, text in tables.up_to_date(kept_rows()).items():
+        assert page.read_text(encoding="utf-8") == text, "a row was kept? python docs/tables.py writes the tables again"
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_the_results_tell_the_seeds_of_every_variant_before_and_after_a_finish(variant):
-    rows, told, before = kept_rows(), [], None
-    for recipe in STAGES:
-        if f"{recipe}_{variant}" not in rows:
-            told += ["not driven yet", "", "", ""]
-            continue
-        returns, frame = (official_returns(rows[f"{recipe}_{name}"]) for name in (variant, "frame"))
-        told += [
-            ", ".join(f"{mean:.1f}" for mean in returns.mean(axis=1)),
-            f"{(returns < 800).sum()} of {returns.size}",
-        ]
-        if before is None:
-            told.append(f"{np.median(returns):.1f}")
-        else:
-            gain = returns - before[: len(returns)]
-            told.append("{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain)))
-        before = returns
-        low, high = bootstrap_gain(frame, returns)
-        told.append("" if variant == "frame" else f"{frame.mean() - returns.mean():.1f} ({-high:.1f} to {-low:.1f})")
-    assert cells(f"`{variant}`, official", RESULTS) == told
+def test_a_table_written_again_takes_the_place_of_the_old_one_and_of_no_other():
+    rows = {name: kept_rows()[name] for name in ("no_bar", "no_bar_frame")}
+    table, other = tables.spread_table(rows), "| row | seeds |\n|---|---|\n| `no_bar` | 1 |\n"
+    stale = f"Before.\n\n{table.replace('18 of 100', '17 of 100')}\n\nAfter.\n\n{other}"
+    assert tables.put_table(stale, table) == f"Before.\n\n{table}\n\nAfter.\n\n{other}" != stale
+    for page in (other, stale + stale):
+        with pytest.raises(ValueError, match=f"has {page.count('After')} tables .* expected one"):
+            tables.put_table(page, table)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -385,22 +371,6 @@ def test_the_words_on_luck_in_the_searches_hold_for_the_records():
         official_returns(rows[name]).mean(axis=1).var(ddof=1) for name in ("one_round", "two_rounds_input")
     )
     assert 0.2 < 2 * f.sf(first / second, 2, 2) < 0.3  # "about one case of four"
-
-
-def test_the_results_tell_what_every_single_change_is_worth():
-    rows = kept_rows()
-    base = official_returns(rows["one_round"])
-    laps = (base >= 900).mean(axis=1)
-    there = f"{laps.mean():.0%} there, {laps.min():.0%} to {laps.max():.0%} by search"
-    assert cells("difference to `one_round`", RESULTS)[-1] == f"complete laps ({there})"
-    for name in [*ABLATIONS, "two_rounds_input"]:
-        if name in rows:
-            found = official_returns(rows[name])
-            mean, median = found.mean() - base.mean(), np.median(found) - np.median(base)
-            interval = "{:+.1f} to {:+.1f}".format(*bootstrap_gain(base, found))
-            told = [f"{mean:+.1f}", interval, f"{median:+.1f}", f"{(found >= 900).mean():.0%}"]
-            about = ROWS[name].about.removeprefix("one round, ")
-            assert cells(f"`{name}` less `one_round`", RESULTS) == [about, *told]
 
 
 def test_the_words_on_single_changes_hold_for_the_records():

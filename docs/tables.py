@@ -1,0 +1,113 @@
+"""Write the tables of the replication's rows into the README and docs/results.md again, and draw the picture of the
+claims: python docs/tables.py
+
+Do so when a row has been kept. The words around the tables stay as they are; the tests name those that no longer hold.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from stad_lab.autoencoder import VARIANTS
+from stad_lab.evaluation import bootstrap
+from stad_lab.plots import plot_claims, to_png
+from stad_lab.rows import ABLATIONS, ROWS
+from stad_lab.table import (
+    bootstrap_gain,
+    claims_and_outcomes,
+    describe_table,
+    kept_rows,
+    official_returns,
+    summarise,
+)
+
+ROOT = Path(__file__).parent.parent
+PICTURE = ROOT / "notebooks" / "pictures" / "claims.png"
+
+
+def line(*cells: str) -> str:
+    """A line of a table in Markdown."""
+    return "| " + " | ".join(cells) + " |"
+
+
+def spread_table(rows: dict[str, list[Path]]) -> str:
+    """How the drives of every row spread."""
+    lines = [line("row", "standard deviation", "median", "below 800", "best 90"), "|---|---|---|---|---|"]
+    for name, folders in rows.items():
+        returns, found = official_returns(folders), summarise(folders)
+        failed = f"{(returns < 800).sum()} of {returns.size}"
+        numbers = f"{found['standard_deviation']:.0f}", f"{np.median(returns):.1f}", failed, f"{found['top_90']:.1f}"
+        lines.append(line(f"`{name}`", *numbers))
+    return "\n".join(lines)
+
+
+def variants_table(rows: dict[str, list[Path]]) -> str:
+    """The four variants of our recipe, seed by seed, before and after the finish."""
+    ahead, lines = "`frame` is ahead by", []
+    head = "official tracks", "seeds, after two rounds", "below 800", "median", ahead
+    lines += [line(*head, "seeds, after the finish", "below 800", "gain of the finish", ahead), "|---" * 9 + "|"]
+    for variant in VARIANTS:
+        cells = [f"`{variant}`, official"]
+        before, after = (official_returns(rows[f"{recipe}_{variant}"]) for recipe in ("two_rounds", "finished"))
+        gain = after - before
+        told = f"{np.median(before):.1f}", "{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain))
+        for recipe, returns, extra in zip(("two_rounds", "finished"), (before, after), told, strict=True):
+            frame = official_returns(rows[f"{recipe}_frame"])
+            low, high = bootstrap_gain(frame, returns)
+            lead = f"{frame.mean() - returns.mean():.1f} ({-high:.1f} to {-low:.1f})" if variant != "frame" else ""
+            seeds = ", ".join(f"{mean:.1f}" for mean in returns.mean(axis=1))
+            cells += [seeds, f"{(returns < 800).sum()} of {returns.size}", extra, lead]
+        lines.append(line(*cells))
+    return "\n".join(lines)
+
+
+def changes_table(rows: dict[str, list[Path]]) -> str:
+    """What every single change of `one_round` is worth."""
+    base = official_returns(rows["one_round"])
+    laps = (base >= 900).mean(axis=1)
+    there = f"{laps.mean():.0%} there, {laps.min():.0%} to {laps.max():.0%} by search"
+    head = "difference to `one_round`", "what differs", "of the mean"
+    interval = "95% interval (of a single search: without its luck)"
+    lines = [line(*head, interval, "of the median", f"complete laps ({there})"), "|---" * 6 + "|"]
+    for name in [*ABLATIONS, "two_rounds_input"]:
+        if name in rows:
+            found = official_returns(rows[name])
+            mean, median = found.mean() - base.mean(), np.median(found) - np.median(base)
+            about = ROWS[name].about.removeprefix("one round, ")
+            interval = "{:+.1f} to {:+.1f}".format(*bootstrap_gain(base, found))
+            numbers = f"{mean:+.1f}", interval, f"{median:+.1f}", f"{(found >= 900).mean():.0%}"
+            lines.append(line(f"`{name}` less `one_round`", about, *numbers))
+    return "\n".join(lines)
+
+
+def put_table(page: str, table: str) -> str:
+    """A page with a table in the place of the one whose first two columns have the same names."""
+    name = " | ".join(table.split(" | ")[:2])
+    found = re.findall(rf"^{re.escape(name)} \|.*\n(?:\|.*\n)+", page, re.M)
+    if len(found) != 1:
+        raise ValueError(f"the page has {len(found)} tables that begin with {name!r}, expected one")
+    return page.replace(found[0], table + "\n")
+
+
+def up_to_date(rows: dict[str, list[Path]]) -> dict[Path, str]:
+    """The pages as the records want them: file -> text."""
+    readme, results = ROOT / "README.md", ROOT / "docs" / "results.md"
+    label = plot_claims(claims_and_outcomes(rows)).get_label()
+    page = put_table(readme.read_text(encoding="utf-8"), describe_table(rows))
+    page = re.sub(r"!\[[^]]*\]\((notebooks/pictures/claims.png)\)", rf"![{label}](\1)", page)
+    missing = ", ".join(f"`{name}`" for name in ROWS if name not in rows)
+    page = re.sub(r"Not made yet: [^.]*\.", f"Not made yet: {missing}.", page)
+    pages = {readme: page, results: results.read_text(encoding="utf-8")}
+    for table in (spread_table(rows), variants_table(rows), changes_table(rows)):
+        pages[results] = put_table(pages[results], table)
+    return pages
+
+
+if __name__ == "__main__":
+    kept = kept_rows()
+    for file, text in up_to_date(kept).items():
+        file.write_text(text, encoding="utf-8")
+        print(file)
+    PICTURE.write_bytes(to_png(plot_claims(claims_and_outcomes(kept))))
+    print(PICTURE)
