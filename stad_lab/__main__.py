@@ -232,7 +232,7 @@ def add_evaluate(commands: argparse._SubParsersAction) -> None:
         "evaluate",
         help="drive an agent on official, unseen tracks",
         description="Drive an agent on Gymnasium's own CarRacing-v3 and print mean, deviation, interval and share"
-        " above 900; every episode goes into a JSON file.",
+        " above 900; every episode goes into a JSON file. Stop it when you like; the same command goes on.",
     )
     add_variant(command)
     add_scheduler(command)
@@ -247,7 +247,7 @@ def add_evaluate(commands: argparse._SubParsersAction) -> None:
         help="where to write the result; default evaluation-VARIANT.json in the run, or here; -fast, -from-TRACK"
         " or -N-tracks is added to the name if it is not the official evaluation",
     )
-    command.set_defaults(do=do_evaluate)
+    command.set_defaults(do=do_evaluate, resumes=True)
 
 
 def do_evaluate(options: argparse.Namespace) -> None:
@@ -258,10 +258,12 @@ def do_evaluate(options: argparse.Namespace) -> None:
     chosen = (options.variant, options.path, options.episodes, options.first_track, options.fast)
     load_agent(*chosen[:2])
     check_writable(file)
+    unfinished = file.with_name(f"unfinished-{file.name}")
     with drivers(options.scheduler) as executor:
-        result = evaluate(*chosen, options.processes, executor)
+        result = evaluate(*chosen, options.processes, executor, unfinished)
     print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
     save_json(file, result)
+    unfinished.unlink()
     print(f"  every episode: {file}")
 
 

@@ -47,9 +47,6 @@ def check_variant(variant: str) -> None:
 class FromOnePixel(nn.ConvTranspose2d):
     """A transposed convolution of pictures of one pixel: a matrix product, and computed as one it is 3 times faster."""
 
-    def __init__(self, in_channels: int, out_channels: int, size: int):
-        super().__init__(in_channels, out_channels, size)
-
     def forward(self, pixel: torch.Tensor) -> torch.Tensor:
         """(batch, in_channels, 1, 1) -> (batch, out_channels, size, size)."""
         size = self.kernel_size[0]

@@ -138,8 +138,6 @@ class Inside:
     """The differences that V redraws: float32 (T, 64, 64, 3); None if its variant does not."""
     mu: np.ndarray
     """Means of z: float32 (T, latent_size)."""
-    logvar: np.ndarray
-    """Logarithms of z's variances: float32 (T, latent_size)."""
     hidden: np.ndarray
     """M's memory before it sees the frame, which C is shown with z: float32 (T, hidden_size)."""
     mixture: Mixture
@@ -171,9 +169,9 @@ def memory_before(after: torch.Tensor) -> np.ndarray:
 def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool) -> Inside:
     """Show V and M a drive from its first frame on, and keep all they make of it; stride and bar as V was trained."""
     frames = drive.frames(crop_bar)
-    mu, logvar = encode_frames(autoencoder, frames, stride)
+    mu, _ = encode_frames(autoencoder, frames, stride)
     after = remember_frames(mdn_rnn, mu, drive.actions)
     hidden, mixture = memory_before(after), mdn_rnn.mixture(after)
     drawn, changed = autoencoder.decode(torch.from_numpy(mu))
     changed = None if changed is None else to_array(changed)
-    return Inside(frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, logvar, hidden, mixture)
+    return Inside(frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, hidden, mixture)

@@ -179,7 +179,7 @@ def check_settings() -> Iterator[Line]:
 def check_weights() -> Iterator[Line]:
     """The trained weights that come with stad_lab."""
     files = sorted(Path(__file__).with_name("pretrained").rglob("*.safetensors"))
-    small = [file.name for file in files if file.stat().st_size < 5000]  # a pointer of Git LFS, or half a download
+    small = [file.name for file in files if file.stat().st_size < 500]  # a pointer of Git LFS, or half a download
     if not files or small:
         found = f"truncated: {', '.join(small)}" if small else "none in stad_lab/pretrained"
         yield Line(RED, "weights", found, "download or clone the whole of stad_lab again")
@@ -208,10 +208,16 @@ def check_drive() -> Iterator[Line]:
 def check_processors() -> Iterator[Line]:
     """Processor cores that this process may use, and whether others keep them busy."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    limit = LIMITS / "cpu.max"
+    quota, _, period = limit.read_text().partition(" ") if limit.exists() else ("max", "", "")
+    allowed = max(1, int(quota) // int(period)) if quota.isdigit() else cores
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     remedy = "close other programs; on a shared machine, set OMP_NUM_THREADS=1 before you start JupyterLab"
     if load > 2 * cores and os.environ.get("OMP_NUM_THREADS") != "1":  # PyTorch's threads then wait for each other
         yield Line(AMBER, "cores", f"{cores}, and on average {load:.0f} processes want them", remedy)
+    elif allowed < cores and not os.environ.get("OMP_NUM_THREADS"):  # as many threads as cores, and few may run
+        remedy = f"set OMP_NUM_THREADS={allowed} before you start JupyterLab"
+        yield Line(AMBER, "cores", f"{cores}, of which the container may use {allowed}", remedy)
     elif cores == 1:
         yield Line(AMBER, "cores", "1", "all works, at half the stated speed or less: add --set processes=1 to train")
     else:
@@ -256,8 +262,15 @@ def check_gpu() -> Iterator[Line]:
     """A GPU is never needed; where there is one, V and M train on it."""
     import torch
 
-    found = torch.cuda.get_device_name() if torch.cuda.is_available() else "none, and none is needed"
-    yield Line(GREEN, "GPU", found)
+    from stad_lab.training import training_device
+
+    if not torch.cuda.is_available():
+        yield Line(GREEN, "GPU", "none, and none is needed")
+    elif training_device().type == "cuda":
+        yield Line(GREEN, "GPU", torch.cuda.get_device_name())
+    else:
+        remedy = "none is needed; a GPU that is too old for this PyTorch may work with an older CUDA: see pytorch.org"
+        yield Line(AMBER, "GPU", "cannot be used: V and M train on the CPU", remedy)
 
 
 def check_widgets() -> Iterator[Line]:

@@ -9,11 +9,12 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
+from tqdm.auto import tqdm
 
 from stad_lab.agent import load_agent, run_folder
-from stad_lab.checkpoints import checksum
+from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evolution import CONTROLLER, drive_group, hand_out
-from stad_lab.parallel import run_in_order, worker_processes
+from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.rollouts import TRACK_RANGES
 
 SOLVED = 900  # CarRacing counts as solved at a mean return of 900 over 100 tracks
@@ -28,6 +29,7 @@ def evaluate(
     fast: bool = False,
     processes: int = 2,
     executor: Executor | None = None,
+    unfinished: Path | None = None,
 ) -> dict:
     """Drive an agent on the tracks first_track, first_track + 1, ... and sum up.
 
@@ -39,6 +41,8 @@ def evaluate(
         fast: draw with the fast renderer instead of Gymnasium's own.
         processes: worker processes; the numbers do not depend on it.
         executor: who drives; None for so many processes of this machine.
+        unfinished: file that keeps what has been driven, so that an interrupted evaluation goes on from there. It may
+            go when the result has been saved. None keeps nothing.
 
     Returns:
         A dict for JSON: "variant", "renderer" ("official" or "fast"), "controller_sha256" of C's file, "mean",
@@ -58,22 +62,32 @@ def evaluate(
         )
     agent = load_agent(variant, path)
     folder = run_folder(variant, path)
-    controller = checksum((folder / CONTROLLER).read_bytes())  # now, since a search may find a better one meanwhile
-    begin = time.perf_counter()
+    # The checksum now, since a search may find a better one meanwhile.
+    identity = {
+        "variant": variant,
+        "renderer": "fast" if fast else "official",
+        "controller_sha256": checksum((folder / CONTROLLER).read_bytes()),
+    }
+    known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
+    driven = known["driven"] if known.get("identity") == identity else {}
+    begin = time.perf_counter() - (known["seconds"] if driven else 0)
     tracks = list(range(first_track, first_track + episodes))
+    missing = [track for track in tracks if str(track) not in driven]
     with worker_processes(processes, executor) as executor:
         # One car at a time: in a batch the last bits differ, and a script that drives alone should get these numbers.
         source = hand_out(executor, folder, variant)
-        tasks = [(source, variant, agent.parameters, [track], fast, None) for track in tracks]
-        driven = run_in_order(executor, drive_group, tasks, f"evaluate ({variant})")
-    returns, lengths = (np.concatenate(part) for part in zip(*driven, strict=True))
-    return {
-        "variant": variant,
-        "renderer": "fast" if fast else "official",
-        "controller_sha256": controller,
-        **report(tracks, returns, lengths),
-        "seconds": time.perf_counter() - begin,
-    }
+        tasks = [(source, variant, agent.parameters, [track], fast, None) for track in missing]
+        found = run_tasks(executor, drive_group, tasks)
+        begun = len(tracks) - len(missing)
+        for number, (returns, lengths) in tqdm(
+            found, f"evaluate ({variant})", len(tracks), initial=begun, unit="episode"
+        ):
+            driven[str(missing[number])] = float(returns[0]), int(lengths[0])
+            if unfinished:
+                seconds = time.perf_counter() - begin
+                save_json(unfinished, {"identity": identity, "driven": driven, "seconds": seconds})
+    returns, lengths = (np.array(part) for part in zip(*(driven[str(track)] for track in tracks), strict=True))
+    return {**identity, **report(tracks, returns, lengths), "seconds": time.perf_counter() - begin}
 
 
 def report(tracks: list[int], returns: np.ndarray, lengths: np.ndarray) -> dict:

@@ -336,7 +336,7 @@ def validate(executor: Executor, source: Any, variant: str, settings: Settings, 
     """Drive a controller on the validation tracks: its mean return, all returns, the frames, and which one it was."""
     tracks = track_seeds("validate", settings.validation_tracks)  # the same ones for every seed
     copies = np.repeat(controller[None], len(tracks), axis=0)
-    patient = dataclasses.replace(settings, patience=0)  # as in the final evaluation: nobody is given up on
+    patient = dataclasses.replace(settings, patience=0)  # nobody is given up on, as in the final evaluation
     returns, lengths = drive_parallel(executor, source, variant, copies, tracks, patient)
     return {
         "mean": float(returns.mean()),

@@ -6,6 +6,7 @@ stuck worker is done again: what a task returns depends on its arguments alone, 
 
 import ctypes
 import functools
+import itertools
 import multiprocessing
 import operator
 import os
@@ -13,8 +14,7 @@ import platform
 import signal
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -27,6 +27,7 @@ from tqdm.auto import tqdm
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # from glibc's malloc.h
 PRELOADED = ["stad_lab.pipeline"]  # what a worker imports: 2 to 4 seconds, of which PyTorch takes most
 TIME_LIMIT = 600.0  # seconds without any finished task, after which the workers count as stuck; a task takes some 10
+SLICES = 60  # in which patience is counted
 LOSSES = 3  # pools that may be lost in a row, before we stop to believe that it was an accident
 
 
@@ -56,7 +57,7 @@ class WorkerProcesses(Executor):
             )
         self.count, self.time_limit = count, time_limit
         self.lock, self.closed = threading.RLock(), threading.Event()
-        self.losses, self.unfinished, self.last_sign = 0, 0, time.monotonic()
+        self.losses, self.unfinished, self.silence = 0, 0, 0.0
         self.peak_memory = 0.0  # MB, of the largest process that was alive at the end
         self.pool = self._new_pool()
         self.lost: list[ProcessPoolExecutor] = []  # kept, because one that goes wants the lock that it breaks under
@@ -114,7 +115,7 @@ class WorkerProcesses(Executor):
             return
         with self.lock:
             self.unfinished -= 1
-            self.last_sign = time.monotonic()
+            self.silence = 0.0
             self.losses = 0 if error is None else self.losses
         if error is None:
             task.set_result(attempt.result())
@@ -130,17 +131,18 @@ class WorkerProcesses(Executor):
                     return False
                 print("a worker process was lost: starting new ones, which do its work again", file=sys.stderr)
                 self.lost.append(lost)
-                self.pool, self.last_sign = self._new_pool(), time.monotonic()
+                self.pool, self.silence = self._new_pool(), 0.0
             return True
 
     def _watch(self) -> None:
-        while not self.closed.wait(min(1.0, self.time_limit / 4)):
+        tick = min(1.0, self.time_limit / 4)  # counted, because a clock runs on while this process is suspended
+        while not self.closed.wait(tick):
             with self.lock:
-                silence = time.monotonic() - self.last_sign
-                if not self.unfinished:
-                    self.last_sign = time.monotonic()
-                elif silence > self.time_limit:
-                    print(f"no worker has finished anything for {silence:.0f} seconds: they are stuck", file=sys.stderr)
+                self.silence = self.silence + tick if self.unfinished else 0.0
+                if self.silence > self.time_limit:
+                    told = f"no worker has finished anything for {self.silence:.0f} seconds: they are stuck"
+                    print(told, file=sys.stderr)
+                    self.silence = 0.0
                     self.stop()
 
 
@@ -169,22 +171,31 @@ def worker_processes(count: int, given: Executor | None = None, time_limit: floa
 
 
 def run_tasks(
-    executor: Executor, function: Callable, tasks: list[tuple], time_limit: float = 2 * LOSSES * TIME_LIMIT
+    executor: Executor,
+    function: Callable,
+    tasks: list[tuple],
+    time_limit: float = 2 * LOSSES * TIME_LIMIT,
+    ahead: int | None = None,
 ) -> Iterator[tuple[int, object]]:
     """Call `function(*task)` for every task, and yield (number of the task, what it returned) as they are finished.
+
+    Args:
+        ahead: how many tasks may have begun whose results are not yielded yet, for results that are large; None: all.
 
     Raises:
         ValueError, OSError: as raised by a task.
         TaskError: a task failed otherwise, or no task was finished for `time_limit` seconds.
     """
-    waiting = {executor.submit(function, *task): number for number, task in enumerate(tasks)}
+    to_begin, waiting = enumerate(tasks), {}
     try:
-        while waiting:
-            done, _ = wait(waiting, time_limit, return_when=FIRST_COMPLETED)
-            if not done:
-                raise TaskError(f"nothing was heard of the workers for {time_limit:.0f} seconds: see whether they live")
-            for future in done:
-                number = waiting.pop(future)
+        while True:
+            for number, task in itertools.islice(to_begin, (ahead or len(tasks)) - len(waiting)):
+                waiting[executor.submit(function, *task)] = number
+            if not waiting:
+                return
+            done = finished_first(waiting, time_limit)
+            while done:  # emptied, so that nobody holds on to a result
+                number = waiting.pop(future := done.pop())
                 try:
                     result = future.result()
                 except (ValueError, OSError):
@@ -196,6 +207,21 @@ def run_tasks(
     finally:
         for future in waiting:
             future.cancel()
+
+
+def finished_first(waiting: Iterable[Future], time_limit: float) -> set[Future]:
+    """Those of some futures that are finished, as soon as there are any.
+
+    It waits in slices, because a clock runs on while this process is suspended: one slice is lost, not all patience.
+
+    Raises:
+        TaskError: none was finished for `time_limit` seconds.
+    """
+    for _ in range(SLICES):
+        done, _ = wait(waiting, time_limit / SLICES, return_when=FIRST_COMPLETED)
+        if done:
+            return done
+    raise TaskError(f"nothing was heard of the workers for {time_limit:.0f} seconds: see whether they live")
 
 
 def run_in_order(executor: Executor, function: Callable, tasks: list[tuple], label: str | None = None) -> list:

@@ -185,6 +185,8 @@ def open_record(folder: Path, variant: str, settings: Settings, command: str, be
         save_json(path, record)
         return record
     record = load_json(path)
+    if "settings" not in record:
+        raise ValueError(f"{folder} holds the record of {record['variant']}, which is no run: choose another folder")
     check_same_run(
         path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
     )
@@ -336,7 +338,6 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
         raise ValueError(f"{folder} is where agents are shipped to: give the folder of a run")
     shipped = [name for name in (*WEIGHTS, "record.json", LOG) if (folder / name).exists()]
     read = {name: load_tensors(folder / name) for name in shipped if name in WEIGHTS}  # all, before any is written
-    target.mkdir(parents=True, exist_ok=True)
     for name, (tensors, facts) in read.items():
         small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
         save_tensors(target / name, small, **facts)
@@ -344,6 +345,6 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
         if name not in read:
             copy_file(folder / name, target)
     for file in target.glob("*.*"):
-        if file.name not in shipped:
+        if file.is_file() and file.name not in shipped:
             file.unlink()
     return target

@@ -154,7 +154,9 @@ def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
     """Drive what a search found on the official tracks, and write `evaluation.json`, if that does not tell of it."""
     path, found = folder / "evaluation.json", checksum((folder / CONTROLLER).read_bytes())
     if not path.exists() or load_json(path, "run the same command again")["controller_sha256"] != found:
-        save_json(path, evaluate(row.variant, folder, TRACKS, executor=executor))
+        unfinished = folder / "unfinished-evaluation.json"
+        save_json(path, evaluate(row.variant, folder, TRACKS, executor=executor, unfinished=unfinished))
+        unfinished.unlink()
 
 
 def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[int] | None = None) -> list[Path]:
@@ -203,7 +205,6 @@ def keep_histories(source: Path, target: Path) -> None:
 
 def copy_records(source: Path, target: Path) -> None:
     """Copy a run's records, as far as it has them."""
-    target.mkdir(parents=True, exist_ok=True)
     for file in KEPT:
         if (source / file).exists():
             copy_file(source / file, target)

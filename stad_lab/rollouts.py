@@ -33,6 +33,7 @@ TRACK_RANGES = {
     "inspect": (4_000_000, 5_000_000),
 }
 NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array's shape is short
+UNWRITTEN = 1e9  # bytes of episodes that may wait for the disk
 FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
 COLLECT_SETTINGS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
 AGENT_SETTINGS = ("agent_episodes", "max_frames", "patience")  # and if an agent drives for it, too
@@ -172,7 +173,8 @@ def collect(
     with locked(folder):
         check_disk(folder, sum(longest[index] for index in missing) * FRAME_BYTES)
         save_json(manifest_path, manifest)
-        episodes = run_tasks(executor, drive_episode, [tasks[index] for index in missing])
+        ahead = max(8, int(UNWRITTEN / (max(longest) * FRAME_BYTES)))
+        episodes = run_tasks(executor, drive_episode, [tasks[index] for index in missing], ahead=ahead)
         for number, episode in tqdm(episodes, "collect", len(tasks), initial=len(done), unit="episode"):
             entry = save_block(folder, missing[number], *episode)
             manifest["blocks"] = sorted([*manifest["blocks"], entry], key=lambda entry: entry["index"])

@@ -5,6 +5,9 @@ that their agent sees later. In a second round that agent drives for the data, b
 are trained anew on both. A new V has other latents, and the old C is lost on them. But its outputs on the recorded
 drives are known, so a ridge regression finds the C that gives the same outputs from the new z and h, and evolution goes
 on from there. That costs no episode. (World Models, section 5, proposes such rounds for harder tasks.)
+
+V draws its batches from all frames alike, M its sequences from all episodes alike: of these the agent's, which are
+long, are only about one in ten.
 """
 
 from concurrent.futures import Executor

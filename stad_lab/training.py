@@ -5,7 +5,9 @@ Generator seeded with both. So a run that was interrupted and resumed makes the 
 for bit on the CPU, with as many threads, and nearly so on a GPU, whose convolutions add up in any order.
 """
 
+import functools
 import math
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -20,12 +22,19 @@ from stad_lab.settings import check_same_run
 RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
 
+@functools.cache
 def training_device() -> torch.device:
-    """Where V and M are trained: on a CUDA GPU if there is one, unless CUDA_VISIBLE_DEVICES is set to nothing.
+    """Where V and M are trained: on a CUDA GPU if there is one that computes, unless CUDA_VISIBLE_DEVICES is nothing.
 
     Agents always drive on the CPU, in many processes.
     """
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if torch.cuda.is_available():
+        try:
+            torch.ones(1, device="cuda").add_(1).item()
+            return torch.device("cuda")
+        except (RuntimeError, AssertionError) as error:  # too old for this PyTorch, or others have taken all of it
+            print(f"the GPU cannot be used, so V and M train on the CPU: {error}", file=sys.stderr)
+    return torch.device("cpu")
 
 
 def fit(

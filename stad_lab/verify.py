@@ -121,9 +121,14 @@ def verify_mdn_rnn(folder: Path, variant: str, settings: Settings) -> str:
     return "ok"
 
 
+def lacks(folder: Path, *names: str) -> bool:
+    """Whether a file, or V or M, with which it is checked, is not in the folder: kept records have no weights."""
+    return not all((folder / name).exists() for name in ("autoencoder.safetensors", "mdn_rnn.safetensors", *names))
+
+
 def verify_log(folder: Path, variant: str, settings: Settings) -> str:
     """Tell CMA-ES every logged generation again: it must come to the logged means."""
-    if not (folder / LOG).exists():
+    if lacks(folder, LOG):
         return f"none: {NOT_HERE}"
     world_model = read_world_model(folder, variant)
     log = read_log(variant, settings, folder, world_model)
@@ -138,7 +143,7 @@ def verify_log(folder: Path, variant: str, settings: Settings) -> str:
 
 def verify_controller(folder: Path, variant: str, settings: Settings) -> str:
     """Check that C is the one that the log calls the best."""
-    if not (folder / CONTROLLER).exists():
+    if lacks(folder, LOG, CONTROLLER):
         return f"none: {NOT_HERE}"
     log = read_log(variant, settings, folder, read_world_model(folder, variant))
     kept, best = kept_generation(variant, folder, log), log["best"]
@@ -158,7 +163,7 @@ def verify_evaluations(folder: Path) -> str:
 
 def drive_again(folder: Path, variant: str, settings: Settings, executor: Executor | None) -> str:
     """Drive recorded episodes again: of an evaluation, if there is one an official one, or of the look that chose C."""
-    if not (folder / CONTROLLER).exists():
+    if lacks(folder, CONTROLLER):
         return f"none: {NOT_HERE}"
     parameters, _ = load_controller(folder / CONTROLLER, variant)
     evaluations = [load_json(file) for file in sorted(folder.glob("evaluation*.json"))]

@@ -381,5 +381,7 @@ def test_a_damaged_run_is_not_shipped_and_one_without_c_leaves_none_of_before(qu
     assert {file.name: file.read_bytes() for file in target.iterdir()} == before
     (run / "controller.safetensors").unlink()
     (run / "evolution.json").unlink()
+    (target / ".ipynb_checkpoints").mkdir()  # JupyterLab's, and not ours to remove
     ship("input_output", run, tmp_path / "shipped")
-    assert {file.name for file in target.iterdir()} == {"autoencoder.safetensors", "mdn_rnn.safetensors", "record.json"}
+    names = {"autoencoder.safetensors", "mdn_rnn.safetensors", "record.json", ".ipynb_checkpoints"}
+    assert {file.name for file in target.iterdir()} == names

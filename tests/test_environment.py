@@ -11,6 +11,7 @@ import numpy as np
 
 from stad_lab import check_environment, environment
 from stad_lab.agent import PRETRAINED
+from stad_lab.training import training_device
 
 ROOT = Path(__file__).parent.parent
 
@@ -108,6 +109,36 @@ def test_in_a_container_files_that_were_read_do_not_count_as_used_memory(tmp_pat
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=8e9))
     line = next(environment.check_memory())
     assert line.state == "green" and line.found.startswith("2.9")
+
+
+def test_fewer_cores_by_a_container_s_limit_are_amber_unless_the_threads_are_set(tmp_path, monkeypatch):
+    (tmp_path / "cpu.max").write_text("200000 100000\n")
+    monkeypatch.setattr(environment, "LIMITS", tmp_path)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(64)), raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    (limited,) = environment.check_processors()
+    assert limited.state == "amber" and limited.found == "64, of which the container may use 2"
+    assert limited.remedy.startswith("set OMP_NUM_THREADS=2 ")
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert [line.state for line in environment.check_processors()] == ["green"]
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert [line.state for line in environment.check_processors()] == ["green"]
+
+
+def test_a_gpu_that_cannot_compute_is_amber_and_not_trained_on(monkeypatch, capsys):
+    def refuse(*given, device):
+        raise RuntimeError("CUDA error: no kernel image is available for execution on the device")
+
+    training_device.cache_clear()
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.ones", refuse)
+    try:
+        (gpu,) = environment.check_gpu()
+        assert gpu.state == "amber" and "on the CPU" in gpu.found and training_device().type == "cpu"
+    finally:
+        training_device.cache_clear()
+    assert "no kernel image" in capsys.readouterr().err
 
 
 def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):

@@ -8,8 +8,9 @@ import pytest
 
 from stad_lab import load_agent
 from stad_lab.__main__ import main
-from stad_lab.checkpoints import checksum, load_json
+from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import describe, evaluate, summarise
+from stad_lab.parallel import run_tasks
 from stad_lab.rollouts import TRACK_RANGES
 
 TRACK = 3
@@ -74,10 +75,29 @@ def test_a_result_names_the_controller_that_drove_if_a_search_finds_a_better_one
 
     def find_a_better_one(*given):
         (run / "controller.safetensors").write_bytes(b"another")
-        return [(np.array([1.0]), np.array([7]))]
+        yield 0, (np.array([1.0]), np.array([7]))
 
-    monkeypatch.setattr("stad_lab.evaluation.run_in_order", find_a_better_one)
+    monkeypatch.setattr("stad_lab.evaluation.run_tasks", find_a_better_one)
     assert evaluate("input_output", run, episodes=1)["controller_sha256"] == checksum(drove)
+
+
+def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straight_run, fast, tmp_path, monkeypatch):
+    chosen, file, done = ("input_output", straight_run, 2, 10, True), tmp_path / "unfinished.json", []
+
+    def interrupt_after_one(executor, function, tasks):
+        done.append(len(tasks))
+        yield next(run_tasks(executor, function, tasks))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stad_lab.evaluation.run_tasks", interrupt_after_one)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(*chosen, unfinished=file)
+    monkeypatch.setattr("stad_lab.evaluation.run_tasks", lambda *given: done.append(len(given[2])) or run_tasks(*given))
+    result = evaluate(*chosen, unfinished=file)
+    assert done == [2, 1] and result | {"seconds": 0} == fast | {"seconds": 0}
+    drove = load_json(file)
+    save_json(file, drove | {"identity": drove["identity"] | {"controller_sha256": "of another C"}})
+    assert evaluate(*chosen, unfinished=file)["episodes"] == fast["episodes"] and done[-1] == 2
 
 
 def test_the_screen_shows_what_the_summary_says(fast):

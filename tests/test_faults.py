@@ -537,6 +537,18 @@ def test_verify_tells_of_a_part_of_another_run_on_its_own_line(name, part, whole
     assert verify(folder, in_this_process)[part].startswith("FAILED")
 
 
+def test_records_that_were_kept_without_their_weights_are_no_failure(in_this_process):
+    found = verify(RECORDS / "no_M" / "seed0", in_this_process)
+    assert not [outcome for outcome in found.values() if outcome.startswith("FAILED")]
+    assert found["evaluations"].startswith("ok") and found["log of CMA-ES"].startswith("none")
+
+
+def test_a_driver_s_record_is_no_run_to_go_on_with(tmp_path):
+    shutil.copy(RECORDS / "random_driver" / "seed0" / "record.json", tmp_path)
+    with pytest.raises(ValueError, match="holds the record of random_driver, which is no run: choose another folder"):
+        train(VARIANT, SETTINGS, tmp_path)
+
+
 def test_verify_says_of_a_driver_without_an_agent_that_there_is_nothing_to_verify(capsys):
     assert main(["verify", str(RECORDS / "random_driver" / "seed0")]) == 2
     assert "random_driver, which has no V, M and C: there is nothing to verify" in capsys.readouterr().err

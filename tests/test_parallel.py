@@ -1,10 +1,12 @@
 """Workers: where they come from, and memory that is kept for the next step, but not without bound."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -62,6 +64,43 @@ def test_a_script_that_its_workers_read_again_learns_the_remedy(call, tmp_path):
     process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert process.returncode != 0
     assert 'below a line `if __name__ == "__main__":`' in process.stderr and "in use by another" not in process.stderr
+
+
+def test_no_more_results_wait_to_be_taken_than_are_asked_for():
+    begun = []
+    with ThreadPoolExecutor(2) as executor:
+        tasks = run_tasks(executor, begun.append, [(number,) for number in range(20)], ahead=3)
+        for taken, _ in enumerate(tasks, 1):
+            time.sleep(0.01)  # whatever may begin has begun
+            assert len(begun) <= min(20, taken + 3)
+    assert sorted(begun) == list(range(20))
+
+
+SUSPENDED = """
+import sys, time
+from stad_lab.parallel import run_tasks, worker_processes
+
+if __name__ == "__main__":
+    with worker_processes(1, time_limit=3) as executor:
+        tasks = run_tasks(executor, time.sleep, [(0,), (2,)], time_limit=3)
+        next(tasks)
+        print("begun", flush=True)
+        print(list(tasks))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows suspends no process by a signal")
+def test_a_run_that_was_suspended_for_longer_than_its_patience_goes_on(tmp_path):
+    (tmp_path / "script.py").write_text(SUSPENDED)
+    command = [sys.executable, "-W", "ignore", tmp_path / "script.py"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, start_new_session=True, **pipes) as process:
+        assert process.stdout.readline() == "begun\n"
+        os.killpg(process.pid, signal.SIGSTOP)
+        time.sleep(4)
+        os.killpg(process.pid, signal.SIGCONT)
+        told, complaints = process.communicate(timeout=60)
+    assert (process.returncode, told, complaints) == (0, "[(1, None)]\n", "")
 
 
 def send_much():
