@@ -15,10 +15,11 @@ import pytest
 from threadpoolctl import threadpool_limits
 
 from stad_lab.__main__ import main
-from stad_lab.agent import drive, load_controller
-from stad_lab.checkpoints import save_json
+from stad_lab.agent import PRETRAINED, drive, load_controller
+from stad_lab.checkpoints import load_json, save_json
 from stad_lab.controller import initial_parameters
 from stad_lab.evolution import (
+    LOG,
     ask,
     averaged_mean,
     drive_generation,
@@ -30,6 +31,7 @@ from stad_lab.evolution import (
     mean_checksum,
     note_best,
     replay,
+    tell,
     validate,
 )
 from stad_lab.rollouts import TRACK_RANGES
@@ -292,6 +294,39 @@ with ThreadPoolExecutor(1) as executor:
     evolution.evolve("input_output", Settings.preset("quick", generations=2), sys.argv[1], executor)
 print(before, seen["ask"], seen["drive_group"])
 """
+
+
+def test_from_300_parameters_on_two_agents_stand_ahead_of_the_mean_and_behind_it_to_find_the_step_size():
+    quick, random = settings(population=8, sigma_decay=0.0), np.random.default_rng(0)
+    for parameters in (299, 300):
+        growth = []
+        for better in (0, 1):  # the one ahead of the mean, the one behind it
+            strategy = make_strategy(np.zeros(parameters), quick)
+            tell(strategy, ask(strategy, quick, 0), list(random.standard_normal((8, 1))), [])
+            sigma, move = strategy.sigma, strategy.mean / np.linalg.norm(strategy.mean)
+            population = ask(strategy, quick, 1)
+            steps = population - strategy.mean
+            along = steps @ move / np.linalg.norm(steps, axis=1)
+            tell(strategy, population, [[[1.0, -1.0][number != better]] for number in (0, 1)] + [[0.0]] * 6, [])
+            growth.append(strategy.sigma / sigma)
+        if parameters < 300:
+            assert np.abs(along).max() < 0.5
+        else:
+            assert along[:2] == pytest.approx([1, -1]) and np.abs(along[2:]).max() < 0.5
+            assert growth[0] > 1 > growth[1]
+
+
+@pytest.mark.long
+def test_the_shape_stays_round_in_the_long_run_of_notebook_04_as_with_scores_drawn_at_random():
+    log, long_run = load_json(PRETRAINED / "input" / LOG), load_json(PRETRAINED / "input" / "record.json")
+    chosen, random = Settings.from_dict(long_run["settings"]), np.random.default_rng(0)
+    for told in (lambda entry: entry["returns"], lambda entry: random.standard_normal(np.shape(entry["returns"]))):
+        strategy = make_strategy(initial_parameters(32, 256, chosen.initial_gas), chosen)
+        for number, entry in enumerate(log["generations"]):
+            tell(strategy, ask(strategy, chosen, number), list(told(entry)), [])
+        axes = np.sqrt(np.linalg.eigvalsh(strategy.sm.covariance_matrix))
+        assert (round(axes.min(), 2), round(axes.max(), 2)) == (1.00, 1.03)
+        assert strategy.sp.c1 + strategy.sp.cmu == pytest.approx(0.000011, abs=5e-7)
 
 
 def test_a_search_runs_on_one_thread_wherever_more_are_to_be_had(quick_run, tmp_path):
