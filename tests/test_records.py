@@ -148,6 +148,17 @@ def test_the_words_on_the_probe_hold_for_the_study():
     assert all(r2("bar", v, "yaw rate") <= r2("bar", "frame", "yaw rate") + 0.01 for v in VARIANTS)
 
 
+def test_the_table_of_the_yaw_rate_in_notebook_02_is_the_study_s():
+    probe, file = read("study.json")["probe"]["variants"], RECORDS.parent.parent / "notebooks"
+    page = json.loads((file / "02_difference_autoencoders.ipynb").read_text())
+    text = "".join("".join(cell["source"]) for cell in page["cells"] if cell["id"] == "02-35")
+    for variant in VARIANTS:
+        columns = itertools.product(("z", "z, h"), ("random driver", "trained agent"))
+        assert cells(f"`{variant}`", text) == [
+            f"{round(probe[driver][variant][features]['yaw rate']['r2'], 2) + 0.0:.2f}" for features, driver in columns
+        ]
+
+
 def test_the_words_on_v_and_m_in_notebooks_02_and_03_hold_for_the_study():
     study = read("study.json")
     prices = study["autoencoder"]["rate_distortion"]
