@@ -288,30 +288,39 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     theirs = [folder for v in VARIANTS for folder in rows[f"paper_{v}"]]
     means = [load_json(folder / "evaluation.json")["mean"] for folder in theirs]
     chosen = [load_json(folder / LOG)["best"] for folder in theirs]
-    assert [one["generation"] for one in chosen] == [580, 160, 400, 120, 400]
-    flattered = [one["validation"] - mean for one, mean in zip(chosen, means, strict=True)]
-    assert all(90 < points < 110 for points in flattered[:3]) and [round(points) for points in flattered[3:]] == [8, 67]
-    assert [round(mean - means[0]) for mean in means[1:]] == [175, 190, 272, 268] and round(means[3] - means[2]) == 82
-    for count, leads in {
-        5: [25, 156, 125, 195],
-        10: [96, 172, 133, 185],
-        15: [127, 184, 134, 196],
-    }.items():  # of the last looks
-        last = [float(learning_curve(folder)[1][-count:].mean()) for folder in theirs]
-        assert [round(mean - last[0]) for mean in last[1:]] == leads
-    low, high = bootstrap_gain(returns["paper_frame"], returns["paper_output"])
-    assert f"({np.mean(means[2:4]) - means[0]:.0f} on average, {low:.0f} to {high:.0f}, without" in RESULTS
-    low, high = bootstrap_gain(returns["paper_frame"], returns["paper_input_output"])
-    assert f"that of `paper_input_output` {means[4] - means[0]:.0f} ({low:.0f} to {high:.0f}, again" in RESULTS
-    leads = [mean - means[0] for mean in means[1:]]
-    told = f"have {min(means[1:]):.0f} to {max(means[1:]):.0f} and `frame` has {means[0]:.0f}: "
-    assert told + f"{min(leads):.0f} to {max(leads):.0f} points behind" in README
-    assert min(means[1:]) - means[0] > np.ptp(means[2:4])  # so by the letter of the rule the claim holds, so far
-    _, average, best = fitness_curves(load_json(theirs[4] / LOG)["generations"])
-    assert (round(means[4]), round(best.max()), round(average.max())) == (730, 937, 918)
+    assert [one["generation"] for one in chosen] == [580, 280, 160, 400, 120, 400]
+    flattered = [round(one["validation"] - mean) for one, mean in zip(chosen, means, strict=True)]
+    assert [flattered[0], *flattered[2:4]] == [95, 102, 105] and [flattered[1], *flattered[4:]] == [6, 8, 67]
+    frame, others = np.mean(means[:2]), np.array(means[2:])
+    assert [round(lead) for lead in others - frame] == [238, 253, 335, 331]
+    assert [round(float(np.ptp(pair))) for pair in (means[:2], means[3:5])] == [125, 82]
+    for seed, pair, told in ((0, others[:2], [175, 190]), (1, others[2:], [397, 393])):  # on the same tracks
+        assert [round(lead) for lead in pair - means[seed]] == told
+        assert "{} and {}".format(*told) in README and "{} and {}".format(*told) in NOTEBOOK
+    for count, leads in {5: [156, 286, 256, 325], 10: [218, 294, 255, 307], 15: [240, 298, 247, 309]}.items():
+        last = [float(learning_curve(folder)[1][-count:].mean()) for folder in theirs]  # of the last looks
+        assert [round(mean - np.mean(last[:2])) for mean in last[2:]] == leads
+    leads = {v: returns[f"paper_{v}"].mean() - frame for v in VARIANTS if v != "frame"}
+    for variant, lead in leads.items():
+        low, high = bootstrap_gain(returns["paper_frame"], returns[f"paper_{variant}"])
+        assert re.search(rf"`paper_{variant}`[^;(]* {lead:.0f}[^;(]* ?\({low:.0f} to {high:.0f}[;)]", RESULTS), variant
+    told = "have {:.0f} to {:.0f}, the two of `frame` {:.0f} and {:.0f}".format(others.min(), others.max(), *means[:2])
+    assert told in README
+    assert "are {:.0f}, {:.0f} and {:.0f} points ahead of the mean of `frame`".format(*leads.values()) in README
+    assert min(leads.values()) > max(
+        np.ptp(means[:2]), np.ptp(means[3:5])
+    )  # by the letter of the rule it holds, so far
+    assert max(means[:2]) < min(others)  # the two lowest of six: one case of fifteen
+    curves = [fitness_curves(load_json(folder / LOG)["generations"]) for folder in theirs]
+    _, average, best = curves[5]
+    assert (round(means[5]), round(best.max()), round(average.max())) == (730, 937, 918)
+    assert (round(means[1]), round(curves[1][2].max())) == (337, 920)
+    shrunk = [load_json(folder / LOG)["generations"] for folder in theirs]
+    shrunk = [told[0]["sigma"] / told[-1]["sigma"] for told in shrunk]
+    assert [round(times) for times in shrunk] == [34, 6, 30, 2, 19, 6]
     looks = learning_curve(rows["paper_frame"][0])[1]
     assert looks[-5:].argmax() == looks[-5:].tolist().index(looks.max()) == 3
-    assert round(float(np.delete(looks[-5:], 3).mean() - returns["paper_frame"].mean())) == 57  # nobody chose these
+    assert round(float(np.delete(looks[-5:], 3).mean() - means[0])) == 57  # nobody chose these
     assert (returns_of(fast_drives("two_rounds", "frame")[0]) < 800).sum() == 4
     stages = itertools.product(STAGES, VARIANTS)
     fast = {pair: np.concatenate([returns_of(found) for found in fast_drives(*pair)]) for pair in stages}
@@ -395,7 +404,7 @@ def test_the_words_on_luck_in_the_searches_hold_for_the_records():
     cases = {pair: round(100 * share) for pair, share in paired.items()}
     assert cases.pop(("finished", "input_output")) == 2 and {min(cases.values()), max(cases.values())} == {5, 8}
     paper = [official_returns(rows[f"paper_{variant}"]).mean(axis=1) for variant in ("frame", "output")]
-    assert round(1 / float(ttest_ind(*paper).pvalue)) == 5
+    assert round(1 / float(ttest_ind(*paper).pvalue)) == 17
     cases = {pair: round(100 * share) for pair, share in luck.items()}
     assert cases.pop(("finished", "input_output")) == 1 and {min(cases.values()), max(cases.values())} == {6, 8}
     assert sorted(round(1 / share) for (recipe, _), share in luck.items() if recipe == "two_rounds") == [14, 18, 18]
