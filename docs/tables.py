@@ -50,7 +50,7 @@ def variants_table(rows: dict[str, list[Path]]) -> str:
     for variant in VARIANTS:
         cells = [f"`{variant}`, official"]
         before, after = (official_returns(rows[f"{recipe}_{variant}"]) for recipe in ("two_rounds", "finished"))
-        gain = after - before
+        gain = after - before[: len(after)]
         told = f"{np.median(before):.1f}", "{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain))
         for recipe, returns, extra in zip(("two_rounds", "finished"), (before, after), told, strict=True):
             frame = official_returns(rows[f"{recipe}_frame"])

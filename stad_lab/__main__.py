@@ -263,7 +263,7 @@ def do_evaluate(options: argparse.Namespace) -> None:
         result = evaluate(*chosen, options.processes, executor, unfinished)
     print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
     save_json(file, result)
-    unfinished.unlink()
+    unfinished.unlink(missing_ok=True)
     print(f"  every episode: {file}")
 
 

@@ -262,15 +262,15 @@ def check_gpu() -> Iterator[Line]:
     """A GPU is never needed; where there is one, V and M train on it."""
     import torch
 
-    from stad_lab.training import training_device
-
     if not torch.cuda.is_available():
         yield Line(GREEN, "GPU", "none, and none is needed")
-    elif training_device().type == "cuda":
-        yield Line(GREEN, "GPU", torch.cuda.get_device_name())
+        return
+    name, (major, minor) = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
+    if 10 * major + minor < min(int(built.split("_")[1].rstrip("af")) for built in torch.cuda.get_arch_list()):
+        remedy = "none is needed; for this one install a PyTorch that is built for an older CUDA, see pytorch.org"
+        yield Line(AMBER, "GPU", f"{name} is too old for this PyTorch: V and M train on the CPU", remedy)
     else:
-        remedy = "none is needed; a GPU that is too old for this PyTorch may work with an older CUDA: see pytorch.org"
-        yield Line(AMBER, "GPU", "cannot be used: V and M train on the CPU", remedy)
+        yield Line(GREEN, "GPU", name)
 
 
 def check_widgets() -> Iterator[Line]:

@@ -6,6 +6,7 @@ training nor validation ever touches. Each track is named by its seed, so anyone
 
 import time
 from concurrent.futures import Executor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -68,10 +69,10 @@ def evaluate(
         "renderer": "fast" if fast else "official",
         "controller_sha256": checksum((folder / CONTROLLER).read_bytes()),
     }
-    known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
-    driven = known["driven"] if known.get("identity") == identity else {}
-    begin = time.perf_counter() - (known["seconds"] if driven else 0)
     tracks = list(range(first_track, first_track + episodes))
+    known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
+    driven = known["driven"] if known.get("identity") == identity | {"tracks": tracks} else {}
+    begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]
     with worker_processes(processes, executor) as executor:
         # One car at a time: in a batch the last bits differ, and a script that drives alone should get these numbers.
@@ -84,8 +85,9 @@ def evaluate(
         ):
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
-                seconds = time.perf_counter() - begin
-                save_json(unfinished, {"identity": identity, "driven": driven, "seconds": seconds})
+                told = {"identity": identity | {"tracks": tracks}, "driven": driven}
+                with suppress(OSError):  # a full disk costs the right to go on, not the result
+                    save_json(unfinished, told | {"seconds": time.perf_counter() - begin})
     returns, lengths = (np.array(part) for part in zip(*(driven[str(track)] for track in tracks), strict=True))
     return {**identity, **report(tracks, returns, lengths), "seconds": time.perf_counter() - begin}
 

@@ -224,7 +224,7 @@ def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStr
 
     Below 300 parameters pycma adapts the step size by the length of the mean's path. From there on it sets two agents
     of a generation on the line of the mean's last move, one ahead of the mean and one behind it, and lengthens the step
-    if the one ahead ranks better (two-point adaptation).
+    if in the last few generations the one ahead has ranked better (two-point adaptation).
 
     NumPy fills up a seed with zeros: with evolution_seed 0 its numbers are those of the random driver's fourth episode.
     They are used for such different things that nothing follows from it.

@@ -156,7 +156,7 @@ def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
     if not path.exists() or load_json(path, "run the same command again")["controller_sha256"] != found:
         unfinished = folder / "unfinished-evaluation.json"
         save_json(path, evaluate(row.variant, folder, TRACKS, executor=executor, unfinished=unfinished))
-        unfinished.unlink()
+        unfinished.unlink(missing_ok=True)
 
 
 def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[int] | None = None) -> list[Path]:

@@ -25,8 +25,7 @@ class Settings:
     seed: int = 0
     """Seed of the whole run: data and weights follow from it, and with `evolution_seed` the search for C."""
     processes: int = 2
-    """Worker processes that drive cars. The results do not depend on it. A search keeps no more of them busy than a
-    generation has groups of `cars`: four with the laptop settings, two with the paper's."""
+    """Worker processes that drive cars; a search can use one for each group of `cars`. The results are the same."""
 
     # Frames and differences (paper, sections 3.1 and 4)
     crop_bar: bool = True
@@ -100,8 +99,7 @@ class Settings:
     patience: int = 100
     """In training, an episode that reaches no new tile for this many frames is ended; 0 for never."""
     max_frames: int = 1000
-    """Frames of an episode, at most, in a search, in its looks at the validation tracks, and where an agent drives for
-    a second round; CarRacing's own limit is 1,000."""
+    """Frames of an episode in a search, in its looks or for a second round, at most; CarRacing's own limit is 1,000."""
     cars: int = 16
     """Cars that one process drives in step, at most, with one batch through V and M. Fewer keep more processes busy."""
     validate_every: int = 5

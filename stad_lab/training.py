@@ -5,7 +5,6 @@ Generator seeded with both. So a run that was interrupted and resumed makes the 
 for bit on the CPU, with as many threads, and nearly so on a GPU, whose convolutions add up in any order.
 """
 
-import functools
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -22,7 +21,6 @@ from stad_lab.settings import check_same_run
 RECORDS = 20  # entries of the history, and checkpoints, in a long run
 
 
-@functools.cache
 def training_device() -> torch.device:
     """Where V and M are trained: on a CUDA GPU if there is one that computes, unless CUDA_VISIBLE_DEVICES is nothing.
 

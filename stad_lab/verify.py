@@ -122,8 +122,9 @@ def verify_mdn_rnn(folder: Path, variant: str, settings: Settings) -> str:
 
 
 def lacks(folder: Path, *names: str) -> bool:
-    """Whether a file, or V or M, with which it is checked, is not in the folder: kept records have no weights."""
-    return not all((folder / name).exists() for name in ("autoencoder.safetensors", "mdn_rnn.safetensors", *names))
+    """Whether a file is not in the folder, or neither V nor M, with which it is checked: kept records have none."""
+    weights = [folder / "autoencoder.safetensors", folder / "mdn_rnn.safetensors"]
+    return not any(file.exists() for file in weights) or not all((folder / name).exists() for name in names)
 
 
 def verify_log(folder: Path, variant: str, settings: Settings) -> str:

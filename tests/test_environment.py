@@ -126,19 +126,19 @@ def test_fewer_cores_by_a_container_s_limit_are_amber_unless_the_threads_are_set
     assert [line.state for line in environment.check_processors()] == ["green"]
 
 
-def test_a_gpu_that_cannot_compute_is_amber_and_not_trained_on(monkeypatch, capsys):
+def test_a_gpu_that_is_too_old_for_this_pytorch_is_amber_and_not_trained_on(monkeypatch, capsys):
     def refuse(*given, device):
         raise RuntimeError("CUDA error: no kernel image is available for execution on the device")
 
-    training_device.cache_clear()
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Tesla V100")
+    monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["sm_90a", "sm_75", "sm_100", "compute_120"])
     monkeypatch.setattr("torch.ones", refuse)
-    try:
+    for capability, state in (((7, 0), "amber"), ((7, 5), "green"), ((12, 0), "green")):
+        monkeypatch.setattr("torch.cuda.get_device_capability", lambda found=capability: found)
         (gpu,) = environment.check_gpu()
-        assert gpu.state == "amber" and "on the CPU" in gpu.found and training_device().type == "cpu"
-    finally:
-        training_device.cache_clear()
-    assert "no kernel image" in capsys.readouterr().err
+        assert gpu.state == state and "Tesla V100" in gpu.found
+    assert training_device().type == "cpu" and "no kernel image" in capsys.readouterr().err
 
 
 def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):

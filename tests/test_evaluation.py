@@ -84,6 +84,9 @@ def test_a_result_names_the_controller_that_drove_if_a_search_finds_a_better_one
 def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straight_run, fast, tmp_path, monkeypatch):
     chosen, file, done = ("input_output", straight_run, 2, 10, True), tmp_path / "unfinished.json", []
 
+    def refuse_to_write(*given):
+        raise OSError("[Errno 28] No space left on device")
+
     def interrupt_after_one(executor, function, tasks):
         done.append(len(tasks))
         yield next(run_tasks(executor, function, tasks))
@@ -97,6 +100,7 @@ def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straigh
     assert done == [2, 1] and result | {"seconds": 0} == fast | {"seconds": 0}
     drove = load_json(file)
     save_json(file, drove | {"identity": drove["identity"] | {"controller_sha256": "of another C"}})
+    monkeypatch.setattr("stad_lab.evaluation.save_json", refuse_to_write)
     assert evaluate(*chosen, unfinished=file)["episodes"] == fast["episodes"] and done[-1] == 2
 
 

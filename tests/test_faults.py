@@ -543,6 +543,13 @@ def test_records_that_were_kept_without_their_weights_are_no_failure(in_this_pro
     assert found["evaluations"].startswith("ok") and found["log of CMA-ES"].startswith("none")
 
 
+@pytest.mark.parametrize("lost", ["autoencoder.safetensors", "mdn_rnn.safetensors"])
+def test_a_run_that_has_lost_v_or_m_fails(lost, whole, tmp_path, in_this_process):
+    run = shutil.copytree(whole, tmp_path / "run", ignore=shutil.ignore_patterns("rollouts", lost))
+    found = verify(run, in_this_process)
+    assert all(found[part].startswith("FAILED") for part in ("log of CMA-ES", "C"))
+
+
 def test_a_driver_s_record_is_no_run_to_go_on_with(tmp_path):
     shutil.copy(RECORDS / "random_driver" / "seed0" / "record.json", tmp_path)
     with pytest.raises(ValueError, match="holds the record of random_driver, which is no run: choose another folder"):

@@ -173,6 +173,7 @@ def test_the_words_on_v_and_m_in_notebooks_02_and_03_hold_for_the_study():
     assert (round(saved("4", "1"), 1), round(saved("0.25", "0.08"), 2)) == (1.9, 0.14)
     assert [study["autoencoder"]["variants"][variant]["active"] for variant in VARIANTS] == [15, 17, 16, 27]
     assert round(study["mdn_rnn"]["variants"]["input"]["horizon"]["one dream"][-1], 2) == 1.21
+    assert round(study["mdn_rnn"]["variants"]["input"]["horizon"]["mean of the dreams"][-1], 2) == 1.01
     nats = study["mdn_rnn"]["variants"]["input"]["nll"]
     assert round(nats["one Gaussian"]["nats"] - nats["M"]["nats"], 3) == 0.005
     by_chance = study["probe"]["variants"]["random driver"]
