@@ -266,7 +266,8 @@ def check_gpu() -> Iterator[Line]:
         yield Line(GREEN, "GPU", "none, and none is needed")
         return
     name, (major, minor) = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
-    if 10 * major + minor < min(int(built.split("_")[1].rstrip("af")) for built in torch.cuda.get_arch_list()):
+    built = [int(kind[3:].rstrip("af")) for kind in torch.cuda.get_arch_list() if kind.startswith("sm_")]  # NVIDIA's
+    if built and 10 * major + minor < min(built):
         remedy = "none is needed; for this one install a PyTorch that is built for an older CUDA, see pytorch.org"
         yield Line(AMBER, "GPU", f"{name} is too old for this PyTorch: V and M train on the CPU", remedy)
     else:

@@ -138,6 +138,8 @@ def test_a_gpu_that_is_too_old_for_this_pytorch_is_amber_and_not_trained_on(monk
         monkeypatch.setattr("torch.cuda.get_device_capability", lambda found=capability: found)
         (gpu,) = environment.check_gpu()
         assert gpu.state == state and "Tesla V100" in gpu.found
+    monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["gfx906"])  # of another maker
+    assert [line.state for line in environment.check_gpu()] == ["green"]
     assert training_device().type == "cpu" and "no kernel image" in capsys.readouterr().err
 
 
