@@ -47,13 +47,13 @@ def variants_table(rows: dict[str, list[Path]]) -> str:
     ahead, lines = "`frame` is ahead by", []
     head = "official tracks", "seeds, after two rounds", "below 800", "median", ahead
     lines += [line(*head, "seeds, after the finish", "below 800", "gain of the finish", ahead), "|---" * 9 + "|"]
+    frames = [official_returns(rows[f"{recipe}_frame"]) for recipe in ("two_rounds", "finished")]
     for variant in VARIANTS:
         cells = [f"`{variant}`, official"]
         before, after = (official_returns(rows[f"{recipe}_{variant}"]) for recipe in ("two_rounds", "finished"))
         gain = after - before[: len(after)]
         told = f"{np.median(before):.1f}", "{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain))
-        for recipe, returns, extra in zip(("two_rounds", "finished"), (before, after), told, strict=True):
-            frame = official_returns(rows[f"{recipe}_frame"])
+        for frame, returns, extra in zip(frames, (before, after), told, strict=True):
             low, high = bootstrap_gain(frame, returns)
             lead = f"{frame.mean() - returns.mean():.1f} ({-high:.1f} to {-low:.1f})" if variant != "frame" else ""
             seeds = ", ".join(f"{mean:.1f}" for mean in returns.mean(axis=1))
@@ -90,10 +90,9 @@ def put_table(page: str, table: str) -> str:
     return page.replace(found[0], table + "\n")
 
 
-def up_to_date(rows: dict[str, list[Path]]) -> dict[Path, str]:
-    """The pages as the records want them: file -> text."""
+def up_to_date(rows: dict[str, list[Path]], label: str) -> dict[Path, str]:
+    """The pages as the records, and the alternative text of the picture, want them: file -> text."""
     readme, results = ROOT / "README.md", ROOT / "docs" / "results.md"
-    label = plot_claims(claims_and_outcomes(rows)).get_label()
     page = put_table(readme.read_text(encoding="utf-8"), describe_table(rows))
     page = re.sub(r"!\[[^]]*\]\((notebooks/pictures/claims.png)\)", rf"![{label}](\1)", page)
     missing = ", ".join(f"`{name}`" for name in ROWS if name not in rows)
@@ -106,8 +105,9 @@ def up_to_date(rows: dict[str, list[Path]]) -> dict[Path, str]:
 
 if __name__ == "__main__":
     kept = kept_rows()
-    for file, text in up_to_date(kept).items():
+    figure = plot_claims(claims_and_outcomes(kept))
+    for file, text in up_to_date(kept, figure.get_label()).items():
         file.write_text(text, encoding="utf-8")
         print(file)
-    PICTURE.write_bytes(to_png(plot_claims(claims_and_outcomes(kept))))
+    PICTURE.write_bytes(to_png(figure))
     print(PICTURE)

@@ -71,7 +71,8 @@ def evaluate(
     }
     tracks = list(range(first_track, first_track + episodes))
     known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
-    driven = known["driven"] if known.get("identity") == identity | {"tracks": tracks} else {}
+    asked = identity | {"tracks": tracks}
+    driven = known["driven"] if known.get("identity") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]
     with worker_processes(processes, executor) as executor:
@@ -85,9 +86,9 @@ def evaluate(
         ):
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
-                told = {"identity": identity | {"tracks": tracks}, "driven": driven}
+                told = {"identity": asked, "driven": driven, "seconds": time.perf_counter() - begin}
                 with suppress(OSError):  # a full disk costs the right to go on, not the result
-                    save_json(unfinished, told | {"seconds": time.perf_counter() - begin})
+                    save_json(unfinished, told)
     returns, lengths = (np.array(part) for part in zip(*(driven[str(track)] for track in tracks), strict=True))
     return {**identity, **report(tracks, returns, lengths), "seconds": time.perf_counter() - begin}
 
