@@ -4,11 +4,14 @@ import importlib.util
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import nbformat
 import pytest
+from nbclient import NotebookClient
 from nbgrader.api import Gradebook
+from nbgrader.utils import determine_grade
 
 COURSE = Path(__file__).parent.parent / "notebooks" / "exercises"
 NAMES = sorted(folder.name for folder in (COURSE / "source").iterdir())
@@ -73,6 +76,21 @@ def test_autograde_gives_the_solution_full_marks_and_the_stub_none(graded):
     assert {score for score, _ in scores(root, name, "stub").values()} == {0}
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_a_warning_or_a_progress_bar_under_a_check_costs_no_points(name):
+    setup = next(cell["source"] for cell in read_cells(SOURCES[name]) if cell["cell_type"] == "code")
+    (line,) = re.findall(r"^sys\.stderr = .*$", setup, re.MULTILINE)
+    noise = "import sys, warnings\nfrom tqdm import tqdm\nwarnings.warn('careful')\nlist(tqdm(range(2)))"
+    grade = {"nbgrader": {"grade": True, "solution": False, "grade_id": "a", "points": 3, "locked": True}}
+    cells = [nbformat.v4.new_code_cell(f"import sys\n{line}"), nbformat.v4.new_code_cell(noise, metadata=grade)]
+    points = []
+    for some in (cells, cells[1:]):
+        notebook = nbformat.v4.new_notebook(cells=some)
+        NotebookClient(notebook, timeout=60).execute()
+        points.append(determine_grade(notebook.cells[-1])[0])
+    assert points == [3, 0]  # without the line nbgrader gives none
+
+
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
 def test_every_cell_of_the_solution_runs(graded):
     root, name = graded
@@ -128,6 +146,7 @@ def moments():
     found = {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("stad_lab.widgets.show", lambda figure: figure)
+        patch.setattr("sys.stderr", sys.stderr)  # the notebooks set it
         for name in NAMES:
             names = {}
             for cell in read_cells(SOURCES[name]):
