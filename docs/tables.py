@@ -19,7 +19,7 @@ from stad_lab.table import (
     describe_table,
     kept_rows,
     official_returns,
-    summarise,
+    summarise_row,
 )
 
 ROOT = Path(__file__).parent.parent
@@ -35,7 +35,7 @@ def spread_table(rows: dict[str, list[Path]]) -> str:
     """How the drives of every row spread."""
     lines = [line("row", "standard deviation", "median", "below 800", "best 90"), "|---|---|---|---|---|"]
     for name, folders in rows.items():
-        returns, found = official_returns(folders), summarise(folders)
+        returns, found = official_returns(folders), summarise_row(folders)
         failed = f"{(returns < 800).sum()} of {returns.size}"
         numbers = f"{found['standard_deviation']:.0f}", f"{np.median(returns):.1f}", failed, f"{found['top_90']:.1f}"
         lines.append(line(f"`{name}`", *numbers))

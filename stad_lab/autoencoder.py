@@ -186,8 +186,8 @@ def autoencoder_losses(
     total = frame_error + difference_weight * difference_error + kl_weight * max(kl, free_bits * latent_size)
 
     The errors are squared errors summed over a picture's pixels, `kl` is the divergence of q(z | x) from N(0, 1) in
-    nats summed over z, and the floor under it (free bits) is World Models' own. `noise` is N(0, 1) of shape (batch,
-    latent_size).
+    nats summed over z, and the floor under it (free bits, Kingma et al., 2016) is one for the whole picture, as in
+    World Models. `noise` is N(0, 1) of shape (batch, latent_size).
     """
     mu, logvar = autoencoder.encode(frame, difference)
     z = mu + torch.exp(0.5 * logvar) * noise  # the reparameterisation trick: gradients flow through mu and logvar

@@ -6,7 +6,7 @@ can tell apart; difference images lie on one diverging map centred at zero.
 
 import io
 import itertools
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from matplotlib import colormaps
@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from PIL import Image, ImageDraw, ImageFont
 
+from stad_lab.car_racing import TRACK_WIDTH
 from stad_lab.drives import MOTION, Drive, Inside
 from stad_lab.evaluation import SOLVED
 
@@ -337,6 +338,35 @@ def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> F
     return figure
 
 
+def plot_road(road: np.ndarray, paths: dict[str, np.ndarray], title: str, center: int, reach: float) -> Figure:
+    """A lap from above, and a part of it close up, with the ways that cars took.
+
+    Args:
+        road: centres of its tiles, world units (tiles, 2).
+        paths: name -> where a car was in every frame, world units (T, 2).
+        center: the tile around which the second panel is drawn.
+        reach: how far that panel goes to each side, world units.
+    """
+    figure, axes = new_figure(8.6, 4.3, 1, 2)
+    along = np.roll(road, -1, axis=0) - np.roll(road, 1, axis=0)
+    across = TRACK_WIDTH * along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1, keepdims=True)
+    edges = [np.concatenate([edge, edge[:1]]) for edge in (road + across, road - across)]
+    for axis in axes[0]:
+        axis.fill(*np.concatenate([edges[0], edges[1][::-1]]).T, color="0.85", label="road")
+        for (name, path), (color, dash) in zip(paths.items(), STYLES, strict=False):
+            axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
+            axis.plot(*path[-1], "x", color=color, ms=7)
+        axis.set(xlabel="world units", aspect="equal")
+    axes[0, 0].set(ylabel="world units", title="the lap (x: where the drive ends)")
+    (x, y), far = road[center], np.array([-reach, reach])
+    axes[0, 1].set(xlim=x + far, ylim=y + far, title=f"around tile {center}")
+    axes[0, 1].legend(fontsize=8)
+    figure.suptitle(title, fontsize=11)
+    ways = f"the ways of {', '.join(paths)}"
+    figure.set_label(f"{title}. A lap of {len(road)} tiles from above, and close up around tile {center}: {ways}.")
+    return figure
+
+
 def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
     """Everything about one moment of a drive: pictures, latents, forecast, action, and the return so far.
 
@@ -389,7 +419,9 @@ def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
     return figure
 
 
-def plot_search(landscape, generations: list[dict], shown: list[int], reach: float = 4.0) -> Figure:
+def plot_search(
+    landscape: Callable[[np.ndarray], np.ndarray], generations: list[dict], shown: list[int], reach: float = 4.0
+) -> Figure:
     """CMA-ES on a function of two variables: the population and the one-sigma ellipse of some generations.
 
     Args:

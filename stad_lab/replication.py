@@ -24,20 +24,20 @@ import numpy as np
 
 from stad_lab.autoencoder import AutoEncoder
 from stad_lab.benchmark import save_pair, train_m, train_v
-from stad_lab.car_racing import make_env
+from stad_lab.car_racing import MAX_FRAMES, make_env
 from stad_lab.checkpoints import checksum, copy_file, load_json, load_tensors, save_json
 from stad_lab.controller import initial_parameters, squash
 from stad_lab.evaluation import SOLVED, evaluate, report
 from stad_lab.evolution import CONTROLLER, LOG, drive_generation
 from stad_lab.finish import finish
 from stad_lab.mdn_rnn import MDNRNN
-from stad_lab.parallel import run_in_order, worker_processes
+from stad_lab.parallel import run_in_order, work_alone, worker_processes
 from stad_lab.pipeline import provenance, train
 from stad_lab.rollouts import RandomDriver, collect_rollouts
 from stad_lab.rows import ROWS, Row, find_row, is_floor
 from stad_lab.search_space import COMPONENTS, START
 from stad_lab.settings import Settings, check_same_run
-from stad_lab.table import RECORDS, TOP, summarise, worlds
+from stad_lab.table import RECORDS, TOP, summarise_row, worlds
 
 KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every run, as far as it has them
 TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
@@ -55,7 +55,7 @@ def replicate(
         seeds: some of the row's seeds; None for all. A floor has none.
 
     Returns:
-        What `summarise` makes of these seeds.
+        What `summarise_row` makes of these seeds.
 
     Raises:
         ValueError: an unknown row or seed, or a folder with something else in it.
@@ -75,7 +75,7 @@ def replicate(
         first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
         for seed, own in folders.items():
             search(row, seed, own, first, world, executor)
-    return summarise(list(folders.values()))
+    return summarise_row(list(folders.values()))
 
 
 def drive_floor(name: str, folder: Path, executor: Executor | None) -> dict:
@@ -90,7 +90,7 @@ def drive_floor(name: str, folder: Path, executor: Executor | None) -> dict:
         record = {"variant": name, "made_with": provenance(f"python -m stad_lab replicate --row {name} --out ...")}
         save_json(folder / "record.json", record | {"budget": {}})
         save_json(folder / "evaluation.json", told | {"seconds": time.perf_counter() - begin})
-    return summarise([folder])
+    return summarise_row([folder])
 
 
 def drive_blindly(name: str, track: int) -> tuple[float, int]:
@@ -98,6 +98,7 @@ def drive_blindly(name: str, track: int) -> tuple[float, int]:
 
     Rewards do not depend on the renderer, so the fast one serves.
     """
+    work_alone()
     driver, gentle = (
         RandomDriver(np.random.default_rng([0, track])),
         squash(np.array([0.0, Settings().initial_gas, 0.0])),
@@ -218,7 +219,7 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
     An agent's episode is taken to have as many frames as it may have at most, so the searches may be quicker.
     """
     if is_floor(name, seeds):
-        return {"evaluations": TRACKS * 1000 / (Settings().processes * blind_speed(name))}
+        return {"evaluations": TRACKS * MAX_FRAMES / (Settings().processes * blind_speed(name))}
     row = find_row(name, seeds)
     if row.base:
         times, before = forecast(row.base, row.seeds), ROWS[row.base].settings
@@ -235,7 +236,7 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
         "M": sum(s.m_steps * s.m_batch * s.m_sequence for s in rounds) / speed["M"],
         "first search": most_frames(row.first) / speed["V, M, C"] if row.first else 0.0,
         "searches": len(row.seeds) * most_frames(row.settings) / speed["V, M, C"],
-        "evaluations": len(row.seeds) * TRACKS * 1000 / speed["official"],
+        "evaluations": len(row.seeds) * TRACKS * MAX_FRAMES / speed["official"],
     }
 
 

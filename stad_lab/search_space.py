@@ -1,10 +1,10 @@
 """Where CMA-ES searches for C: along each of its weights, or along the few directions in which what C sees varies.
 
 C sees z and h, 288 numbers, and has a weight for each of them and each of its three outputs. But those numbers move
-together: a few dozen principal components hold nearly all of their variance, and along the others a mutation changes
-next to nothing of what C does. With `Settings.components`, CMA-ES searches for the weights of the leading components
-alone. They are fitted to the rollouts, and cost no episode. A C that is linear in them is linear in z and h, so what
-is found is an ordinary C.
+together: a few dozen principal components hold nearly all of their variance, and along the others a mutation adds
+hardly more than a constant to each output, which the biases do as well. With `Settings.components`, CMA-ES searches for
+the weights of the leading components alone. They are fitted to the rollouts, and cost no episode. A C that is linear in
+them is linear in z and h, so what is found is an ordinary C.
 """
 
 from collections.abc import Iterable

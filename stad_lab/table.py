@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from stad_lab.checkpoints import load_json
-from stad_lab.evaluation import RESAMPLES, SOLVED, bootstrap, draw_tracks, middle_95, resampled_means
-from stad_lab.evaluation import summarise as summarise_returns
+from stad_lab.evaluation import RESAMPLES, SOLVED, bootstrap, draw_tracks, middle_95, resampled_means, summarise
 from stad_lab.evolution import LOG
 from stad_lab.pipeline import total_budget
 from stad_lab.rows import FLOORS, ROWS
@@ -51,7 +50,7 @@ def describe_table(rows: dict[str, list[Path]]) -> str:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, folders in rows.items():
-        found, planned = summarise(folders), len(ROWS[name].seeds) if name in ROWS else 1
+        found, planned = summarise_row(folders), len(ROWS[name].seeds) if name in ROWS else 1
         seeds = f"{len(folders)} of {planned}" if len(folders) < planned else f"{len(folders)}"
         low, high = found["interval"]
         lines.append(
@@ -129,7 +128,7 @@ def learning_curve(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(episodes), np.array(scores)
 
 
-def summarise(folders: list[Path]) -> dict:
+def summarise_row(folders: list[Path]) -> dict:
     """What the table shows of a row, from the folders of its seeds.
 
     Returns:
@@ -141,7 +140,7 @@ def summarise(folders: list[Path]) -> dict:
     returns = official_returns(folders)
     budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
     return {
-        **summarise_returns(returns),
+        **summarise(returns),
         "seeds": returns.mean(axis=1).tolist(),
         "worlds": len(worlds(folders)),
         "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),

@@ -20,7 +20,7 @@ from stad_lab.pipeline import ship, total_budget
 from stad_lab.rows import ROWS, Row
 from stad_lab.search_space import load_start, search_space
 from stad_lab.settings import Settings
-from stad_lab.table import RECORDS, learning_curve, summarise
+from stad_lab.table import RECORDS, learning_curve, summarise_row
 from stad_lab.verify import verify
 
 VARIANT = "input_output"
@@ -186,7 +186,7 @@ def test_a_row_of_finishes_goes_on_from_the_seeds_of_its_base(monkeypatch, tmp_p
     assert (tmp_path / "first" / "seed1" / LOG).stat().st_mtime_ns == before
     log = load_json(tmp_path / "last" / "seed1" / LOG)
     assert log["settings"]["evolution_seed"] == 1 and log["settings"]["tracks"] == 2
-    base = summarise([tmp_path / "first" / "seed1"])
+    base = summarise_row([tmp_path / "first" / "seed1"])
     assert found["agents"] == base["agents"] + 2 * 4 and found["episodes"] == base["episodes"] + 2 * 4 * 2 + 2
     episodes, scores = learning_curve(tmp_path / "last" / "seed1")
     assert episodes.tolist() == [found["episodes"]] and len(scores) == 1

@@ -175,14 +175,14 @@ def test_a_notebook_is_committed_without_outputs_so_that_a_diff_shows_what_chang
 def test_every_step_and_figure_that_a_page_speaks_of_is_there(name):
     page = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
     pages = {file.name[:2]: file.read_text(encoding="utf-8") for file in (ROOT / "notebooks").glob("*.ipynb")}
-    steps = re.findall(r"\b(0[0-5]), steps? (\d+)(?:(?:, \d+)*(?:,| and) (\d+))?", page)
+    steps = re.findall(r"\b(0[0-6]), steps? (\d+)(?:(?:, \d+)*(?:,| and) (\d+))?", page)
     for notebook, *numbers in steps:
         for number in filter(None, numbers):
             assert f"## Step {number}. " in pages[notebook], f"{notebook}, step {number}"
-    figures = re.findall(r"\b(0[0-5]), step \d+,(?: exercise \d+,)? \*([^*]+)\*", page)
+    figures = re.findall(r"\b(0[0-6]), step \d+,(?: exercise \d+,)? \*([^*]+)\*", page)
     for notebook, title in figures:
         assert title in pages[notebook], f"{notebook}: {title}"
-    assert len(steps) > 30 and (len(figures) > 10 or name == "glossary") and not re.search(r"\b0[0-5]-\d\d\b", page)
+    assert len(steps) > 30 and (len(figures) > 10 or name == "glossary") and not re.search(r"\b0[0-6]-\d\d\b", page)
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)

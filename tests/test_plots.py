@@ -4,7 +4,17 @@ import itertools
 
 import numpy as np
 
-from stad_lab.plots import STYLES, plot_bars, plot_curves, plot_intervals, plot_mixture, plot_shares, plot_stacks
+from stad_lab.car_racing import TRACK_WIDTH
+from stad_lab.plots import (
+    STYLES,
+    plot_bars,
+    plot_curves,
+    plot_intervals,
+    plot_mixture,
+    plot_road,
+    plot_shares,
+    plot_stacks,
+)
 
 
 def test_the_alternative_text_of_a_figure_tells_its_values():
@@ -41,3 +51,15 @@ def test_every_part_of_a_stack_is_drawn():
     stacks = {"one": dict.fromkeys("abcd", 1.0), "two": dict.fromkeys("abcd", 2.0)}
     bars = plot_stacks(stacks, "T", "x").axes[0].patches
     assert [bar.get_x() + bar.get_width() for bar in bars] == [1, 2, 3, 4, 2, 4, 6, 8]
+
+
+def test_a_road_is_as_wide_as_it_is_and_is_shown_around_its_tile():
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    road = 100 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    figure = plot_road(road, {"one": road[:50] * 1.01, "two": road[:80]}, "A ring", center=50, reach=30)
+    ring, whole = figure.axes[0].patches[0].get_xy(), figure.axes[0].lines
+    radii = np.linalg.norm(ring, axis=1)
+    assert np.isclose(radii.min(), 100 - TRACK_WIDTH) and np.isclose(radii.max(), 100 + TRACK_WIDTH)
+    assert np.allclose(whole[0].get_xydata(), road[:50] * 1.01)
+    assert np.allclose([figure.axes[1].get_xlim(), figure.axes[1].get_ylim()], [[-30, 30], [70, 130]])
+    assert "200 tiles" in figure.get_label() and "one, two" in figure.get_label()

@@ -25,7 +25,7 @@ from stad_lab.table import (
     learning_curve,
     lost_points,
     stage_times,
-    summarise,
+    summarise_row,
 )
 
 TINY = {"processes": 1, "generations": 2, "v_steps": 8, "m_steps": 4}
@@ -165,7 +165,7 @@ def test_a_run_shorter_than_the_window_is_drawn_at_its_mean():
 def test_only_finished_seeds_are_kept_and_they_say_the_same(table, tmp_path):
     folder, summaries = table
     kept = keep("two", folder, tmp_path)
-    assert [path.name for path in kept] == ["seed0", "seed1"] and summarise(kept) == summaries["two"]
+    assert [path.name for path in kept] == ["seed0", "seed1"] and summarise_row(kept) == summaries["two"]
     assert keep("one", folder, tmp_path) == []
     sizes = [path.stat().st_size for path in tmp_path.rglob("*") if path.is_file()]
     assert len(sizes) == 2 * 4 + 4 + 2 and max(sizes) < 200_000  # neither V nor M; a first round is not evaluated
@@ -183,13 +183,13 @@ def test_a_seed_that_was_made_elsewhere_joins_the_row_and_its_world_that_of_seed
     kept = tmp_path / "kept"
     for place, seed in (("here", "seed0"), ("elsewhere", "seed1")):
         assert [path.name for path in keep("two", tmp_path / place, kept)] == [seed]
-    assert summarise(kept_rows(kept)["two"]) == summaries["two"] and summaries["two"]["worlds"] == 1
+    assert summarise_row(kept_rows(kept)["two"]) == summaries["two"] and summaries["two"]["worlds"] == 1
     assert sorted(path.name for path in (kept / "two").iterdir()) == ["first", "seed0", "seed1", "world"]
     trained, log = {"variant": "of another training"}, tmp_path / "elsewhere" / "two" / "seed1" / "evolution.json"
     save_json(tmp_path / "elsewhere" / "two" / "world" / "record.json", trained)
     save_json(log, load_json(log) | {"autoencoder": "of another training"})
     keep("two", tmp_path / "elsewhere", kept)
-    assert summarise(kept_rows(kept)["two"])["worlds"] == 2
+    assert summarise_row(kept_rows(kept)["two"])["worlds"] == 2
     assert load_json(kept / "two" / "world" / "record.json") == load_json(folder / "two" / "world" / "record.json")
     assert load_json(kept / "two" / "world_of_seed1" / "record.json")["variant"] == trained["variant"]
     first = [kept / "two" / place / "evolution.json" for place in ("first", "first_of_seed1")]
