@@ -20,6 +20,7 @@ from stad_lab.frames import FrameMemory, to_frame
 from stad_lab.mdn_rnn import MDNRNN, check_partner, load_mdn_rnn
 
 PRETRAINED = Path(__file__).parent / "pretrained"
+CONTROLLER = "controller.safetensors"  # the file of C
 
 
 class Agent:
@@ -88,7 +89,11 @@ class Agent:
 
         Args:
             before: `state` as it was before that `act`.
+
+        Raises:
+            ValueError: the agent has not acted since its reset.
         """
+        self._check_acted()
         seen, done = torch.from_numpy(self.latents)[:, None], torch.from_numpy(actions)[:, None]
         _, self.state = self.mdn_rnn.remember(seen, done, before)
 
@@ -97,10 +102,19 @@ class Agent:
         return self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
 
     def keep(self, cars: np.ndarray) -> None:
-        """Go on with some of the cars only, until the next reset: `cars` are their indices among the present ones."""
+        """Go on with some of the cars only, until the next reset: `cars` are their indices among the present ones.
+
+        Raises:
+            ValueError: the agent has not acted since its reset.
+        """
+        self._check_acted()
         self.memory.keep(cars)
         self.state = tuple(part[:, cars] for part in self.state)
         self.latents, self.hidden, self.cars = self.latents[cars], self.hidden[cars], self.cars[cars]
+
+    def _check_acted(self) -> None:
+        if self.latents is None:
+            raise ValueError("the agent has not acted yet: call agent.act(observation) first")
 
     def _check_count(self, count: int) -> None:
         if count == 0:
@@ -209,7 +223,7 @@ def run_folder(variant: str, path: str | Path | None = None) -> Path:
     if path is not None:
         return Path(path)
     folders = [PRETRAINED / variant, PRETRAINED / "second_round" / variant]
-    return next((folder for folder in folders if (folder / "controller.safetensors").exists()), folders[0])
+    return next((folder for folder in folders if (folder / CONTROLLER).exists()), folders[0])
 
 
 def load_agent(variant: str, path: str | Path | None = None) -> Agent:
@@ -227,8 +241,8 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
     """
     check_variant(variant)
     folder = run_folder(variant, path)
-    if path is None and not (folder / "controller.safetensors").exists():
-        shipped = ", ".join(sorted({file.parent.name for file in PRETRAINED.rglob("controller.safetensors")}))
+    if path is None and not (folder / CONTROLLER).exists():
+        shipped = ", ".join(sorted({file.parent.name for file in PRETRAINED.rglob(CONTROLLER)}))
         raise FileNotFoundError(
             f"no trained {variant!r} agent comes with stad_lab, only {shipped or 'none at all'}: train one with"
             f" `python -m stad_lab train --variant {variant} --out runs/{variant}` and give path='runs/{variant}'"
@@ -238,7 +252,7 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
             f"{folder} is {'empty' if folder.is_dir() else 'not a folder'}: expected a run made by"
             f" `python -m stad_lab train --variant {variant} --out {folder}`"
         )
-    world_model, path = read_world_model(folder, variant), folder / "controller.safetensors"
+    world_model, path = read_world_model(folder, variant), folder / CONTROLLER
     parameters, facts = load_controller(path, variant)
     agent = Agent(world_model.autoencoder, world_model.mdn_rnn, parameters, world_model.stride, world_model.crop_bar)
     check_partner(path, facts, **world_model.identities)

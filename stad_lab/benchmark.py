@@ -40,7 +40,7 @@ from stad_lab.controller import control, initial_parameters
 from stad_lab.evolution import drive_group, drive_parallel, hand_out, make_strategy
 from stad_lab.frames import OBSERVATION_SHAPE, FrameMemory, to_frame
 from stad_lab.mdn_rnn import MDNRNN, mdn_loss, save_mdn_rnn
-from stad_lab.parallel import keep_freed_memory, worker_processes
+from stad_lab.parallel import keep_freed_memory, run_in_order, worker_processes
 from stad_lab.pipeline import provenance
 from stad_lab.rollouts import RandomDriver, Rollouts, collect_rollouts, track_seeds
 from stad_lab.settings import Settings
@@ -122,7 +122,7 @@ def describe(name: str, table: dict) -> str:
 def measure_parity(rounds: int) -> dict:
     """Drive 20 whole episodes in both environments, on and off the road."""
     with worker_processes(2) as executor:
-        episodes = list(tqdm(executor.map(compare_pictures, range(20)), "parity", 20, unit="episode"))
+        episodes = run_in_order(executor, compare_pictures, [(number,) for number in range(20)], "parity")
     names = ("whole picture", "window of 24 x 24 around the car", "indicator bar")
     errors = np.concatenate([errors for errors, _ in episodes])
     table = {f"{name}, mean": float(mean) for name, mean in zip(names, errors.mean(axis=0), strict=True)}
@@ -195,7 +195,7 @@ def random_actions(number: int) -> np.ndarray:
     return np.array([driver.act() for _ in range(MAX_FRAMES)])
 
 
-def random_episodes(env, number: int, seconds: float = 1.0) -> float:
+def random_episodes(env: gym.Env, number: int, seconds: float = 1.0) -> float:
     """Frames a second of whole episodes, driven until so many seconds have passed."""
     actions, frames, episodes, begin = random_actions(number), 0, 0, time.perf_counter()
     while time.perf_counter() - begin < seconds:
@@ -209,7 +209,7 @@ def random_episodes(env, number: int, seconds: float = 1.0) -> float:
     return frames / (time.perf_counter() - begin)
 
 
-def pool_episode(pool, number: int) -> float:
+def pool_episode(pool: Any, number: int) -> float:
     """Frames a second of EnvPool, which resets itself: as many frames as an episode has, one reset among them."""
     actions, begin = random_actions(number)[:, None], time.perf_counter()
     for action in actions:
@@ -232,16 +232,12 @@ def measure_loop(rounds: int) -> dict:
     population = agent.parameters + 0.01 * rng.standard_normal((settings.population, agent.parameters.size))
     with tempfile.TemporaryDirectory() as large, worker_processes(1) as one, worker_processes(2) as two:
         make_world_models_sizes(Path(large))
-
-        def generation(executor: Executor, where: Path, number: int) -> float:
-            tracks = track_seeds("evolve", settings.tracks, 9, number) * settings.population
-            return parallel_speed(executor, where, population, tracks, settings)
-
+        speed = functools.partial(generation_speed, population, settings)
         contenders = {
             "Gymnasium alone, no agent, 2 processes": lambda number: gymnasium_speed(two, number),
-            "8 agents, shipped V + M + C, 2 processes": lambda number: generation(two, folder, number),
-            "8 agents, shipped V + M + C, 1 process": lambda number: generation(one, folder, number),
-            "8 agents, World Models' sizes, 2 processes": lambda number: generation(two, Path(large), number),
+            "8 agents, shipped V + M + C, 2 processes": functools.partial(speed, two, folder),
+            "8 agents, shipped V + M + C, 1 process": functools.partial(speed, one, folder),
+            "8 agents, World Models' sizes, 2 processes": functools.partial(speed, two, Path(large)),
         }
         for contender in contenders.values():
             contender(rounds)
@@ -275,10 +271,11 @@ def save_pair(folder: Path, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, settings:
     save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, autoencoder.variant, settings, [], identity)
 
 
-def parallel_speed(executor: Executor, folder: Any, agents: np.ndarray, tracks: list[int], settings: Settings) -> float:
-    """Frames a second of all agents together, each on its track."""
+def generation_speed(agents: np.ndarray, settings: Settings, executor: Executor, source: Any, number: int) -> float:
+    """Frames a second of all agents together, each on the tracks of the generation of this number."""
+    tracks = track_seeds("evolve", settings.tracks, 9, number) * len(agents)
     begin = time.perf_counter()
-    _, lengths = drive_parallel(executor, folder, VARIANT, agents, tracks, settings)
+    _, lengths = drive_parallel(executor, source, VARIANT, agents, tracks, settings)
     return lengths.sum() / (time.perf_counter() - begin)
 
 
@@ -378,7 +375,7 @@ def measure_training(rounds: int) -> dict:
     return tables | {"frames a second, M at paper settings": take_turns(contenders, rounds, "M")}
 
 
-def in_fresh_process(function: Callable, *arguments):
+def in_fresh_process(function: Callable, *arguments) -> Any:
     """What `function` returns in a new Python process: memory that one contender keeps must not help the next one."""
     with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as executor:
         return executor.submit(function, *arguments).result()
@@ -486,15 +483,11 @@ def measure_cluster(rounds: int) -> dict:
         cluster(small.scheduler_address) as dask_one,
         cluster(large.scheduler_address) as dask_two,
     ):
-
-        def generation(executor: Executor, source: Any, number: int) -> float:
-            tracks = track_seeds("evolve", settings.tracks, 9, number) * settings.population
-            return parallel_speed(executor, source, agents, tracks, settings)
-
+        speed = functools.partial(generation_speed, agents, settings)
         executors = {"own processes, 1": one, "own processes, 2": two}
         executors |= {"Dask, 1 worker": dask_one, "Dask, 2 workers": dask_two}
         contenders = {
-            name: functools.partial(generation, executor, hand_out(executor, PRETRAINED / VARIANT, VARIANT))
+            name: functools.partial(speed, executor, hand_out(executor, PRETRAINED / VARIANT, VARIANT))
             for name, executor in executors.items()
         }
         for contender in contenders.values():

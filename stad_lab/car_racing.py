@@ -19,6 +19,7 @@ import functools
 import itertools
 import math
 import os
+from collections.abc import Iterable
 
 os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # pygame greets on import, in every worker process
 
@@ -110,18 +111,18 @@ class FastCarRacing(reference.CarRacing):
         self._bar = bar
         self.ground = Ground()
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None):
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
         """As Gymnasium's reset; the new track is painted on first sight."""
         self.ground.painted = False
         return super().reset(seed=seed, options=options)
 
-    def step(self, action: np.ndarray | None):
+    def step(self, action: np.ndarray | None) -> tuple[np.ndarray, float, bool, bool, dict]:
         """As Gymnasium's step, but an action that is not finite is refused: a NaN once earned an instant 999 here."""
         if action is not None and not np.isfinite(action).all():
             raise ValueError(f"action {action}: expected finite numbers, steering, gas and brake")
         return super().step(action)
 
-    def close(self):
+    def close(self) -> None:
         """As Gymnasium's close, and lets go of the texture and the track, which would be kept for long, or for good."""
         super().close()
         self._destroy()
@@ -208,7 +209,7 @@ class Ground:
         cv2.warpAffine(self.levels[level], matrix, (OBSERVATION_SIZE, BAR_TOP), view, flags)
 
 
-def darkened(color) -> list[int]:
+def darkened(color: Iterable[float]) -> list[int]:
     """A colour of Gymnasium's as it comes out of pygame's smoothscale."""
     return [max(0, int(c) - DARKENING) for c in color]
 

@@ -12,6 +12,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import torch
 from filelock import FileLock, Timeout
@@ -142,7 +143,7 @@ def save_json(path: Path, value: dict) -> None:
     write_bytes(path, (json.dumps(value | {CHECKSUM: checksum_of_json(value)}, indent=1) + "\n").encode())
 
 
-def checksum_of_json(value) -> str:
+def checksum_of_json(value: Any) -> str:
     """SHA-256 of what JSON says, whatever its spaces and line ends."""
     return checksum(json.dumps(json.loads(json.dumps(value))).encode())
 

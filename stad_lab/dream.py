@@ -91,7 +91,7 @@ class DreamEnv(gym.Env):
         """Dream one frame on: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h}).
 
         Raises:
-            ValueError: an action that is not three finite numbers.
+            ValueError: an action that is not three finite numbers, or a temperature that was set to 0 or less.
             RuntimeError: called before `reset`.
         """
         if self.latents is None:

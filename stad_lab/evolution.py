@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from stad_lab.agent import (
+    CONTROLLER,
     Agent,
     WorldModel,
     drive,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     import cma
 
 LOG = "evolution.json"
-CONTROLLER = "controller.safetensors"
 REMEMBERED, RESTING = 20, 4  # generations from which a hard track may be driven again, and the last ones, which rest
 
 
@@ -355,8 +355,9 @@ def drive_parallel(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode for each row of `parameters` (episodes, parameters): (returns, lengths in frames).
 
-    They drive in groups of at most `settings.cars`, under its max_frames and patience, and in two at least, so that two
-    cores have work. The groups do not depend on how many processes share them, so neither do the numbers.
+    They drive in groups of at most `settings.cars`, under its max_frames and patience, and in two groups if there are
+    two episodes, so that two cores have work. The groups do not depend on how many processes share them, so neither do
+    the numbers.
     """
     size = min(settings.cars, math.ceil(len(tracks) / 2))
     groups = [slice(start, start + size) for start in range(0, len(tracks), size)]

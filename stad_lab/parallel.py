@@ -96,7 +96,8 @@ class WorkerProcesses(Executor):
         context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
         if sys.platform == "linux":
             context.set_forkserver_preload(PRELOADED)
-        return ProcessPoolExecutor(self.count, mp_context=context, initializer=start_worker)
+        count = min(self.count, 61) if sys.platform == "win32" else self.count  # as many as Windows can wait for
+        return ProcessPoolExecutor(count, mp_context=context, initializer=start_worker)
 
     def _begin(self, task: Future, work: Callable) -> None:
         pool = self.pool
@@ -270,8 +271,8 @@ def has_glibc() -> bool:
 def peak_memory(executor: Executor | None = None) -> dict[str, float] | None:
     """The most memory, in MB, that this process and the largest process of an executor have held; None on Windows.
 
-    The worker's is there only if there was one of this machine's. On Linux it includes what workers share (about
-    170 MB), elsewhere it is that of the largest worker of any executor so far.
+    On Linux the worker's is there only if there was one of this machine's, and includes what workers share (about
+    170 MB); elsewhere it is that of the largest child process so far, git among them.
     """
     if sys.platform == "win32":
         return None

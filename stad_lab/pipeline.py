@@ -27,13 +27,13 @@ from pathlib import Path
 
 import torch
 
-from stad_lab.agent import PRETRAINED
+from stad_lab.agent import CONTROLLER, PRETRAINED
 from stad_lab.autoencoder import check_variant, load_autoencoder, train_autoencoder
 from stad_lab.checkpoints import copy_file, load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.evolution import LOG, evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
 from stad_lab.parallel import peak_memory, refuse_in_starting_worker, worker_processes
-from stad_lab.rollouts import COLLECT_SETTINGS, collect_rollouts
+from stad_lab.rollouts import COLLECT_SETTINGS, MANIFEST, collect_rollouts
 from stad_lab.search_space import COMPONENTS, START, find_components
 from stad_lab.second_round import carry_over, check_earlier_agent, collect_again, order_of_episodes
 from stad_lab.settings import Settings, check_same_run
@@ -42,7 +42,7 @@ from stad_lab.training import training_device
 STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
 PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
-WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, COMPONENTS, "controller.safetensors")
+WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, COMPONENTS, CONTROLLER)
 GIVE_A_RUN = "give the folder of a run, as `python -m stad_lab train --out` makes it"
 
 
@@ -284,7 +284,7 @@ def budget(settings: Settings, folder: Path, rollouts_folder: Path | None) -> di
     """
     spent = {"random": {"episodes": 0, "frames": 0}}
     numbers = order_of_episodes(settings) if settings.agent_episodes else range(settings.episodes)
-    for block in load_json(rollouts_folder / "manifest.json")["blocks"] if rollouts_folder else ():
+    for block in load_json(rollouts_folder / MANIFEST)["blocks"] if rollouts_folder else ():
         driver = "random" if numbers[block["index"]] < settings.episodes else "agent_driver"
         one = spent.setdefault(driver, {"episodes": 0, "frames": 0})
         one["episodes"] += 1
@@ -324,8 +324,8 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     """Copy what a run has trained into `stad_lab/pretrained/`: records as they are, V and M in half precision.
 
     Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run. A second
-    round, or a finish, goes into a folder `second_round` of its own; returns the new folder. All else that is there,
-    of an agent that was shipped before, is removed, its evaluation too.
+    round, or a finish, goes into a folder `second_round` of its own; returns the new folder. All other files
+    there with an ending, of an agent that was shipped before, are removed, its evaluation too.
 
     Raises:
         FileNotFoundError: the run has no V.

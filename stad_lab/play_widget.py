@@ -12,10 +12,11 @@ import ipywidgets
 from ipyevents import Event
 
 from stad_lab.play import KEYS, Session
+from stad_lab.plots import ORANGE
 from stad_lab.widgets import picture_png
 
 PICTURE_SIZE = 448  # pixels on the page
-FRAME_IDLE, FRAME_LISTENING = "4px solid transparent", "4px solid #E69F00"
+FRAME_IDLE, FRAME_LISTENING = "4px solid transparent", f"4px solid {ORANGE}"
 LONGEST_WAIT = 0.2  # seconds that the car waits for a browser which has not shown the last pictures yet
 PRESSED, RELEASED = ("mousedown", "touchstart"), ("mouseup", "mouseleave", "touchend", "touchcancel")
 PEDAL_ICONS = {"gas": "arrow-up", "left": "arrow-left", "brake": "arrow-down", "right": "arrow-right"}

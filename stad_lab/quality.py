@@ -179,7 +179,6 @@ def dream_with(
     awake: int,
     dreams: int = 16,
     temperature: float = 1.0,
-    seed: int = 0,
 ) -> np.ndarray:
     """Let M dream on with the actions that were really driven: open loop.
 
@@ -192,7 +191,7 @@ def dream_with(
     Returns:
         The dreamed z of frames awake, awake + 1, ..., T - 1: float32 (dreams, drives, T - awake, latent_size).
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     z, a = (torch.from_numpy(np.tile(part, (dreams, 1, 1))) for part in (latents, actions))
     mixture, state = mdn_rnn(z[:, :awake], a[:, :awake])
     dreamed = [sample_mixture(Mixture(*(part[:, -1:] for part in mixture)), temperature, generator)]

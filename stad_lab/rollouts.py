@@ -33,6 +33,7 @@ TRACK_RANGES = {
     "inspect": (4_000_000, 5_000_000),
 }
 NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array's shape is short
+MANIFEST = "manifest.json"
 UNWRITTEN = 1e9  # bytes of episodes that may wait for the disk
 FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
 COLLECT_SETTINGS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
@@ -159,27 +160,33 @@ def collect(
     Returns, and raises, as `collect_rollouts`.
     """
     folder = Path(folder)
-    manifest_path = folder / "manifest.json"
-    manifest = load_json(manifest_path) if manifest_path.exists() else {"settings": made_with, "blocks": []}
-    if manifest["settings"] != made_with:
-        raise ValueError(
-            f"{folder} holds rollouts collected with {manifest['settings']}, and now {made_with} is asked for:"
-            " choose another folder or the same settings"
-        )
-    done = {entry["index"] for entry in manifest["blocks"]}
-    missing = [index for index in range(len(tasks)) if index not in done]
-    if not missing:
+    if len(read_manifest(folder, made_with)["blocks"]) == len(tasks):
         return False
     with locked(folder):
+        manifest = read_manifest(folder, made_with)  # again: another process may have collected until now
+        done = {entry["index"] for entry in manifest["blocks"]}
+        missing = [index for index in range(len(tasks)) if index not in done]
         check_disk(folder, sum(longest[index] for index in missing) * FRAME_BYTES)
-        save_json(manifest_path, manifest)
+        save_json(folder / MANIFEST, manifest)
         ahead = max(8, int(UNWRITTEN / (max(longest) * FRAME_BYTES)))
         episodes = run_tasks(executor, drive_episode, [tasks[index] for index in missing], ahead=ahead)
         for number, episode in tqdm(episodes, "collect", len(tasks), initial=len(done), unit="episode"):
             entry = save_block(folder, missing[number], *episode)
             manifest["blocks"] = sorted([*manifest["blocks"], entry], key=lambda entry: entry["index"])
-            save_json(manifest_path, manifest)
+            save_json(folder / MANIFEST, manifest)
     return True
+
+
+def read_manifest(folder: Path, made_with: dict) -> dict:
+    """The manifest of the rollouts in `folder`, or a new one. ValueError if it is damaged, or of other settings."""
+    path = folder / MANIFEST
+    manifest = load_json(path) if path.exists() else {"settings": made_with, "blocks": []}
+    if manifest["settings"] != made_with:
+        raise ValueError(
+            f"{folder} holds rollouts collected with {manifest['settings']}, and now {made_with} is asked for:"
+            " choose another folder or the same settings"
+        )
+    return manifest
 
 
 def check_disk(folder: Path, needed: int) -> None:
@@ -226,7 +233,7 @@ def check_seen(path: Path, seen: str | None, folder: Path) -> None:
     Args:
         seen: identity of the rollouts that they were trained on; None if that is not known.
     """
-    manifest = Path(folder) / "manifest.json"
+    manifest = Path(folder) / MANIFEST
     if seen and manifest.exists() and seen != identity_of(load_json(manifest)):
         raise ValueError(f"{path} was trained on other rollouts than those in {folder}: give its own ones")
 
@@ -248,7 +255,7 @@ class Rollouts:
     def __init__(self, folder: Path):
         self.folder = Path(folder)
         remedy = f"collect the rollouts first: python -m stad_lab train ... --rollouts {self.folder}"
-        self.manifest = load_json(self.folder / "manifest.json", remedy)
+        self.manifest = load_json(self.folder / MANIFEST, remedy)
         made_with = self.manifest["settings"]
         found, wanted = len(self.manifest["blocks"]), made_with["episodes"] + made_with.get("agent_episodes", 0)
         if found != wanted:

@@ -177,7 +177,7 @@ SHARES = ("random_starts", "revisited_share", "averaged_share", "sigma_decay")
 FEATURES = ("z, h", "z", "h")
 
 
-def check_value(name: str, kind: type, value) -> None:
+def check_value(name: str, kind: type, value: object) -> None:
     """Raise ValueError unless `value` is a sensible value of the field `name`."""
     if type(value) is not kind and not (kind is float and type(value) is int):
         raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")

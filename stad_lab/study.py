@@ -7,7 +7,8 @@
     mdn_rnn      the quality of M: its NLL beside simple forecasts and lesser M's, its calibration, its dreams' error
 
 The V and M that come with stad_lab are measured. What else the comparison needs is trained in a working folder, on
-rollouts by the settings that those had, and an interrupted study goes on where it stopped. (The shipped ones saw the
+rollouts by the settings that those had, and is kept; what is measured is measured again at every start (--part names
+the parts that are missing). (The shipped ones saw the
 pictures of an earlier version of the fast renderer: what is trained here has the advantage of the present one.)
 """
 
@@ -18,7 +19,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from tqdm.auto import tqdm
 
 from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model
 from stad_lab.autoencoder import VARIANTS, AutoEncoder, check_facts, kl_divergence, load_autoencoder
@@ -35,7 +35,7 @@ from stad_lab.drives import (
 from stad_lab.evaluation import bootstrap
 from stad_lab.frames import earlier_frames
 from stad_lab.mdn_rnn import MDNRNN, check_partner, encode_rollouts, fit_mdn_rnn, load_mdn_rnn
-from stad_lab.parallel import worker_processes
+from stad_lab.parallel import run_in_order, worker_processes
 from stad_lab.pipeline import open_record, provenance, train
 from stad_lab.probe import probe
 from stad_lab.quality import (
@@ -122,7 +122,7 @@ def agent_drives(count: int, processes: int) -> list[Drive]:
 def record_all(record: Callable[[int], Drive], numbers: list[int], label: str, processes: int) -> list[Drive]:
     """`record` of every number, in worker processes."""
     with worker_processes(processes) as executor:
-        return list(tqdm(executor.map(record, numbers), f"{label} drives", len(numbers), unit="drive"))
+        return run_in_order(executor, record, [(number,) for number in numbers], f"{label} drives")
 
 
 def begin_agent_drive(track: int) -> Drive:

@@ -18,7 +18,7 @@ from stad_lab.checkpoints import load_into, load_tensors, save_tensors
 from stad_lab.parallel import keep_freed_memory, return_freed_memory
 from stad_lab.settings import check_same_run
 
-RECORDS = 20  # entries of the history, and checkpoints, in a long run
+ENTRIES = 20  # of the history, and checkpoints, in a long run
 
 
 def training_device() -> torch.device:
@@ -72,7 +72,7 @@ def fit(
     optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate, fused=True)  # one pass over the weights, not ten
     history = load_state(checkpoint, model, optimizer, identity) if checkpoint.exists() else []
     start, sums = history[-1]["step"] if history else 0, {}
-    every = max(1, steps // RECORDS)
+    every = max(1, steps // ENTRIES)
     step = start
     try:
         if watch and history:

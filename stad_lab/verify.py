@@ -64,7 +64,8 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         "evaluations": lambda: verify_evaluations(folder),
         "drives": lambda: drive_again(folder, variant, settings, executor),
     }
-    excuse = "; ".join(filter(None, map(other_machine, starts(record))))
+    here = provenance("")
+    excuse = "; ".join(filter(None, (other_machine(start, here) for start in starts(record))))
     return {name: outcome(check, excuse) for name, check in checks.items()}
 
 
@@ -82,9 +83,8 @@ def outcome(check: Callable[[], str], excuse: str) -> str:
         return f"FAILED: {error}"
 
 
-def other_machine(made_with: dict) -> str:
-    """In what this machine differs from that of the record; nothing if it is the same."""
-    here = provenance("")
+def other_machine(made_with: dict, here: dict) -> str:
+    """In what this machine, `here`, differs from that of the record; nothing if it is the same."""
     return ", ".join(
         f"{name} is {here[name]!r} and was {made_with.get(name, 'not recorded')!r}"
         for name in (*MACHINE, *PACKAGES)

@@ -97,6 +97,14 @@ def test_keep_goes_on_with_some_of_the_cars(cars, observations):
         assert np.allclose(kept, expected[[0, 2]], atol=1e-5)
 
 
+def test_an_agent_that_has_not_acted_says_so():
+    agent = make_agent(cars=3)
+    with pytest.raises(ValueError, match="has not acted yet"):
+        agent.keep(np.array([0]))
+    with pytest.raises(ValueError, match="has not acted yet"):
+        agent.take_in(np.zeros((3, 3), np.float32), None)
+
+
 def test_a_folder_that_is_made_again_is_read_again(tmp_path):
     run = tmp_path / "run"
     for shipped, cropped in (("input", True), ("second_round/input", False)):

@@ -16,8 +16,8 @@ from stad_lab.benchmark import (
     benchmark,
     describe,
     frame_budget,
+    generation_speed,
     make_world_models_sizes,
-    parallel_speed,
     take_turns,
     train_m,
     train_v,
@@ -44,11 +44,10 @@ def test_contenders_take_turns_in_alternating_order():
     assert "60    3.00x" in describe("frames a second", table)
 
 
-def test_the_parts_of_a_frame_add_up_to_the_whole():
+def test_each_part_of_a_frame_takes_less_than_the_whole():
     budget = frame_budget(cars=2, frames=40)
     whole = budget.pop("together")
-    assert sum(budget.values()) == pytest.approx(whole)
-    assert {"physics", "picture", "preparation", "V", "M", "C"} < budget.keys()
+    assert budget.keys() == {"physics", "reset", "picture", "preparation", "V", "M", "C", "all else"}
     assert all(0 < budget[name] < whole for name in ("physics", "preparation", "V", "M", "C"))
 
 
@@ -58,7 +57,7 @@ def test_agents_drive_with_world_models_sizes(tmp_path):
     agent = load_agent(VARIANT)
     assert read_world_model(tmp_path, VARIANT).autoencoder.width == brief.width > agent.autoencoder.width
     with ThreadPoolExecutor(1) as executor:
-        assert parallel_speed(executor, tmp_path, agent.parameters[None], [7], brief) > 0
+        assert generation_speed(agent.parameters[None], brief, executor, tmp_path, 0) > 0
 
 
 @pytest.mark.long

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from stad_lab.parallel import has_glibc, peak_memory, run_tasks, worker_processes
+from stad_lab.parallel import WorkerProcesses, has_glibc, peak_memory, run_tasks, worker_processes
 
 FREED = """
 import numpy as np
@@ -64,6 +64,12 @@ def test_a_script_that_its_workers_read_again_learns_the_remedy(call, tmp_path):
     process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert process.returncode != 0
     assert 'below a line `if __name__ == "__main__":`' in process.stderr and "in use by another" not in process.stderr
+
+
+def test_on_windows_there_are_as_many_processes_as_it_can_wait_for(monkeypatch):
+    monkeypatch.setattr(sys, "platform", "win32")
+    with WorkerProcesses(64) as executor:
+        assert executor.pool._max_workers == 61
 
 
 def test_no_more_results_wait_to_be_taken_than_are_asked_for():

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,7 @@ import pytest
 
 from stad_lab.__main__ import main
 from stad_lab.car_racing import make_env
-from stad_lab.checkpoints import checksum, save_json
+from stad_lab.checkpoints import checksum, locked, save_json
 from stad_lab.frames import difference_image, episode_differences, to_frame
 from stad_lab.rollouts import (
     TRACK_RANGES,
@@ -89,6 +90,24 @@ def test_a_complete_collection_is_left_alone(copied):
     before = contents(copied)
     assert not collect_rollouts(Settings.preset("quick"), copied)
     assert contents(copied) == before
+
+
+def test_what_another_process_collected_a_moment_ago_is_not_driven_again(tmp_path, monkeypatch):
+    settings, folder, lock = Settings.preset("quick", episodes=3, episode_frames=30), tmp_path / "shared", locked
+    written = {}
+
+    def lock_late(place):
+        monkeypatch.setattr("stad_lab.rollouts.locked", lock)
+        with ThreadPoolExecutor(1) as other:
+            collect_rollouts(settings, folder, other)
+        written.update({path: path.stat().st_mtime_ns for path in folder.glob("*.npy")})
+        return lock(place)
+
+    monkeypatch.setattr("stad_lab.rollouts.locked", lock_late)
+    with ThreadPoolExecutor(1) as executor:
+        collect_rollouts(settings, folder, executor)
+    assert len(Rollouts(folder).frames) == 3
+    assert written and {path: path.stat().st_mtime_ns for path in folder.glob("*.npy")} == written
 
 
 def test_the_manifest_tells_settings_seeds_counts_and_checksums(quick_run):
