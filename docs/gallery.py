@@ -13,7 +13,7 @@ import nbformat
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
-CELLS = ("00-11", "01-16", "02-17", "02-34", "03-31", "04-08")
+CELLS = ("00-11", "01-16", "02-17", "02-34", "03-31", "04-08", "06-15")
 
 
 def figure_of(cell: str) -> bytes:
