@@ -202,7 +202,7 @@ def run_tasks(
                 except (ValueError, OSError):
                     raise
                 except Exception as error:
-                    name = getattr(function, "__name__", function)
+                    name = getattr(getattr(function, "func", function), "__name__", function)  # a partial has none
                     raise TaskError(f"{name} failed in a worker: {type(error).__name__}: {error}") from error
                 yield number, result
     finally:

@@ -166,6 +166,8 @@ def collect(
         manifest = read_manifest(folder, made_with)  # again: another process may have collected until now
         done = {entry["index"] for entry in manifest["blocks"]}
         missing = [index for index in range(len(tasks)) if index not in done]
+        if not missing:
+            return False
         check_disk(folder, sum(longest[index] for index in missing) * FRAME_BYTES)
         save_json(folder / MANIFEST, manifest)
         ahead = max(8, int(UNWRITTEN / (max(longest) * FRAME_BYTES)))

@@ -7,9 +7,9 @@
     mdn_rnn      the quality of M: its NLL beside simple forecasts and lesser M's, its calibration, its dreams' error
 
 The V and M that come with stad_lab are measured. What else the comparison needs is trained in a working folder, on
-rollouts by the settings that those had, and is kept; what is measured is measured again at every start (--part names
-the parts that are missing). (The shipped ones saw the
-pictures of an earlier version of the fast renderer: what is trained here has the advantage of the present one.)
+rollouts by the settings that those had, and is kept; what is measured is measured again at every start (choose with
+--part what is still missing). (The shipped ones saw the pictures of an earlier version of the fast renderer: what is
+trained here has the advantage of the present one.)
 """
 
 import dataclasses

@@ -483,6 +483,8 @@ def test_the_rule_of_notebook_05_is_no_fair_coin():
         means = scatter * rng.standard_normal((200_000, 4, 1)) + rng.standard_normal((200_000, 4, 3))
         leads, ranges = means[:, 1:].mean(axis=2) - means[:, :1].mean(axis=2), np.ptp(means, axis=2)
         holds[scatter] = 1 / (leads > np.maximum(ranges[:, 1:], ranges[:, :1])).all(axis=1).mean()
+    told = "one case of a thousand", "in one of 56 if", "in one of fifteen if", "in one of four if V's luck is all"
+    assert all(words in NOTEBOOK for words in told)
     assert 800 < holds[0] < 1250 and 50 < holds[1] < 62 and 14 < holds[2] < 16 and 3.9 < holds[1e6] < 4.1
 
 

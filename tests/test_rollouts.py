@@ -105,7 +105,7 @@ def test_what_another_process_collected_a_moment_ago_is_not_driven_again(tmp_pat
 
     monkeypatch.setattr("stad_lab.rollouts.locked", lock_late)
     with ThreadPoolExecutor(1) as executor:
-        collect_rollouts(settings, folder, executor)
+        assert not collect_rollouts(settings, folder, executor)
     assert len(Rollouts(folder).frames) == 3
     assert written and {path: path.stat().st_mtime_ns for path in folder.glob("*.npy")} == written
 
