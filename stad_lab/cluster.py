@@ -7,7 +7,7 @@ seeds alone, so a cluster changes how long a run takes and nothing else (on othe
 import importlib.metadata
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from distributed import Client, Future, Security
@@ -81,7 +81,15 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
             raise ValueError(
                 f"a worker of {address} lacks a package ({error}): install the same environment.txt on all machines"
             ) from error
-        yield ClusterExecutor(client, pure=False)
+        # Dask's memory manager drops copies that no waiting task asks for, so between two generations those of V and M.
+        managed = client.amm.running()
+        client.amm.stop()
+        try:
+            yield ClusterExecutor(client, pure=False)
+        finally:
+            if managed:
+                with suppress(OSError):  # a scheduler that is lost by now
+                    client.amm.start()
 
 
 def check_address(address: str) -> None:

@@ -87,9 +87,12 @@ def open_parcel(parcel, number):
 def test_what_is_shared_travels_once_to_every_worker_and_not_with_each_task(scheduler):
     with cluster(scheduler[0]) as executor:
         parcel = executor.share(Parcel())
+        time.sleep(2.5)  # longer than Dask's memory manager waits until it drops what no task is waiting for
         found = [future.result() for future in [executor.submit(open_parcel, parcel, number) for number in range(40)]]
     assert len({process for process, _ in found}) == WORKERS
     assert max(arrived for _, arrived in found) == 1
+    with Client(scheduler[0], set_as_default=False) as client:
+        assert client.amm.running()  # again, as it was before
 
 
 def test_a_collection_on_a_cluster_is_the_same_to_the_last_bit(scheduler, quick_run, tmp_path):
