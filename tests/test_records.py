@@ -290,55 +290,6 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     lost = {variant: lost_points(rows[f"two_rounds_{variant}"]) for variant in VARIANTS}
     medians = {variant: np.median(returns[f"two_rounds_{variant}"]) for variant in VARIANTS}
     assert max(medians, key=medians.get) == "output" and np.ptp(list(medians.values())) < 5
-    theirs = [folder for v in VARIANTS for folder in rows[f"paper_{v}"]]
-    means = [load_json(folder / "evaluation.json")["mean"] for folder in theirs]
-    chosen = [load_json(folder / LOG)["best"] for folder in theirs]
-    assert [one["generation"] for one in chosen] == [580, 280, 160, 400, 120, 400]
-    flattered = [round(one["validation"] - mean) for one, mean in zip(chosen, means, strict=True)]
-    assert [flattered[0], *flattered[2:4]] == [95, 102, 105] and [flattered[1], *flattered[4:]] == [6, 8, 67]
-    frame, others = np.mean(means[:2]), np.array(means[2:])
-    assert [round(lead) for lead in others - frame] == [238, 253, 335, 331]
-    assert [round(float(np.ptp(pair))) for pair in (means[:2], means[3:5])] == [125, 82]
-    for seed, pair, told in ((0, others[:2], [175, 190]), (1, others[2:], [397, 393])):  # on the same tracks
-        assert [round(lead) for lead in pair - means[seed]] == told
-        assert "{} and {}".format(*told) in README and "{} and {}".format(*told) in NOTEBOOK
-    for count, leads in {5: [156, 286, 256, 325], 10: [218, 294, 255, 307], 15: [240, 298, 247, 309]}.items():
-        last = [float(learning_curve(folder)[1][-count:].mean()) for folder in theirs]  # of the last looks
-        assert [round(mean - np.mean(last[:2])) for mean in last[2:]] == leads
-    searches = {(folder.parent.name, folder.name): folder for folder in theirs}
-    paired = {}  # (variant, seed) -> its lead over `frame` of the same seed: the last 5 and 15 looks, generations
-    for (name, seed), folder in searches.items():
-        if name != "paper_frame" and ("paper_frame", seed) in searches:
-            pair = folder, searches["paper_frame", seed]
-            looks = [learning_curve(one)[1] for one in pair]
-            average = [fitness_curves(load_json(one / LOG)["generations"])[1] for one in pair]
-            ends = [round(float(looks[0][-count:].mean() - looks[1][-count:].mean())) for count in (5, 15)]
-            paired[name, seed] = ends + [round(float((average[0] - average[1])[i : i + 100].mean())) for i in (0, 100)]
-    assert list(paired.values()) == [
-        [25, 127, 151, 304],
-        [156, 184, -35, 190],
-        [386, 360, 167, 376],
-        [455, 422, 134, 229],
-    ]
-    leads = {v: returns[f"paper_{v}"].mean() - frame for v in VARIANTS if v != "frame"}
-    for variant, lead in leads.items():
-        low, high = bootstrap_gain(returns["paper_frame"], returns[f"paper_{variant}"])
-        assert re.search(rf"`paper_{variant}`[^;(]* {lead:.0f}[^;(]* ?\({low:.0f} to {high:.0f}[;)]", RESULTS), variant
-    told = "have {:.0f} to {:.0f}, the two of `frame` {:.0f} and {:.0f}".format(others.min(), others.max(), *means[:2])
-    assert told in README
-    assert "are {:.0f}, {:.0f} and {:.0f} points ahead of the mean of `frame`".format(*leads.values()) in README
-    scatter = max(np.ptp(means[:2]), np.ptp(means[3:5]))
-    assert min(leads.values()) > scatter  # by the letter of the rule it holds, so far
-    assert max(means[:2]) < min(others)  # the two lowest of six: one case of fifteen
-    logs = [load_json(folder / LOG)["generations"] for folder in theirs]
-    curves = [fitness_curves(log) for log in logs]
-    _, average, best = curves[5]
-    assert (round(means[5]), round(best.max()), round(average.max())) == (730, 937, 918)
-    assert (round(means[1]), round(curves[1][2].max())) == (337, 920)
-    assert [round(log[0]["sigma"] / log[-1]["sigma"]) for log in logs] == [34, 6, 30, 2, 19, 6]
-    looks = learning_curve(rows["paper_frame"][0])[1]
-    assert looks[-5:].argmax() == looks[-5:].tolist().index(looks.max()) == 3
-    assert round(float(np.delete(looks[-5:], 3).mean() - means[0])) == 57  # nobody chose these
     assert (returns_of(fast_drives("two_rounds", "frame")[0]) < 800).sum() == 4
     stages = itertools.product(STAGES, VARIANTS)
     fast = {pair: np.concatenate([returns_of(found) for found in fast_drives(*pair)]) for pair in stages}
@@ -422,6 +373,70 @@ def test_the_instructor_s_answers_are_those_of_the_records():
     assert (drives < 700).sum() == 2
 
 
+def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
+    rows = kept_rows()
+    searches = {(v, int(folder.name[-1])): folder for v in VARIANTS for folder in rows[f"paper_{v}"]}
+    mean = {key: load_json(folder / "evaluation.json")["mean"] for key, folder in searches.items()}
+    logs = {key: load_json(folder / LOG) for key, folder in searches.items()}
+    curves = {key: fitness_curves(log["generations"]) for key, log in logs.items()}
+    looks = {key: learning_curve(folder)[1] for key, folder in searches.items()}
+    stuck, frames = ("input", 1), [("frame", 0), ("frame", 1)]
+    four = [key for key in searches if key not in frames and key != stuck]
+    assert list(searches) == [*frames, ("input", 0), stuck, ("output", 0), ("output", 1), ("input_output", 1)]
+
+    frame = np.mean([mean[key] for key in frames])  # the scores
+    ends = min(mean[key] for key in four), max(mean[key] for key in four)
+    told = "The two of `frame` have {:.0f} and {:.0f}".format(*(mean[key] for key in frames))
+    both = "four have {:.0f} to {:.0f}".format(*ends)
+    assert told in README and both in README and told in NOTEBOOK and both in NOTEBOOK
+    assert f"has {mean[stuck]:.1f}: its search" in README and f"has {mean[stuck]:.1f}: it never" in NOTEBOOK
+    assert max(mean[key] for key in frames) < ends[0]  # without the stuck one: the two lowest of six, one of fifteen
+    leads = {v: official_returns(rows[f"paper_{v}"]).mean() - frame for v in VARIANTS if v != "frame"}
+    told = "are {output:.0f} and {input_output:.0f} points ahead of the mean of `frame`".format(**leads)
+    told += f", and `input` is {-leads['input']:.0f} behind"
+    assert told in README and told in NOTEBOOK
+    assert leads["input"] < 0 < leads["output"]  # so neither "holds" nor "fails": mixed
+    for variant, lead in leads.items():
+        low, high = bootstrap_gain(*(official_returns(rows[f"paper_{v}"]) for v in ("frame", variant)))
+        assert re.search(rf"`paper_{variant}`[^;(]* {lead:.0f}[^;(]* ?\({low:.0f} to {high:.0f}[;)]", RESULTS), variant
+    apart = {v: round(abs(mean[v, 0] - mean[v, 1])) for v in ("input", "frame", "output")}
+    gap = f"{apart['input']} points apart, those of `frame` {apart['frame']}, those of `output` {apart['output']}"
+    assert gap in README and gap in NOTEBOOK
+    pairs = {key: round(mean[key] - mean["frame", key[1]]) for key in searches if key not in frames}
+    assert [pairs[key] for key in four] == [175, 190, 397, 393]
+    assert f"and {pairs[stuck]} for `input`" in README and f"`input` is {-pairs[stuck]} behind" in NOTEBOOK
+
+    chosen = [log["best"]["generation"] for log in logs.values()]  # the searches
+    assert "generations {}, {}, {}, {}, {}, {} and {}".format(*chosen) in NOTEBOOK
+    flattered = {key: round(logs[key]["best"]["validation"] - mean[key]) for key in searches}
+    assert [flattered[key] for key in (("frame", 0), ("input", 0), ("output", 0))] == [95, 102, 105]
+    assert [flattered[key] for key in (("frame", 1), ("output", 1), ("input_output", 1))] == [6, 8, 67]
+    lowest = {count: np.mean([looks[key][-count:].mean() for key in frames]) for count in (5, 15)}
+    over = [[round(float(looks[key][-count:].mean() - low)) for key in four] for count, low in lowest.items()]
+    assert over == [[156, 286, 256, 325], [240, 298, 247, 309]]
+    paired = []
+    for key in four:
+        partner = "frame", key[1]
+        paired.append([round(float((looks[key][-n:] - looks[partner][-n:]).mean())) for n in (5, 15)])
+        average = curves[key][1] - curves[partner][1]
+        paired[-1] += [round(float(average[start : start + 100].mean())) for start in (0, 100)]
+    assert paired == [[25, 127, 151, 304], [156, 184, -35, 190], [386, 360, 167, 376], [455, 422, 134, 229]]
+    shrunk = {key: log["generations"][0]["sigma"] / log["generations"][-1]["sigma"] for key, log in logs.items()}
+    assert [round(shrunk[key]) for key in searches if key != stuck] == [34, 6, 30, 2, 19, 6]
+    assert round(shrunk[stuck]) == 34
+    hundreds = [curves[stuck][1][start : start + 100].mean() for start in range(0, 600, 100)]
+    assert max(hundreds) < 0 and official_returns([searches[stuck]]).max() < 800
+    assert (round(mean["input_output", 1]), *(round(c.max()) for c in curves["input_output", 1][:0:-1])) == (
+        730,
+        937,
+        918,
+    )
+    assert (round(mean["frame", 1]), round(curves["frame", 1][2].max())) == (337, 920)
+    last = looks["frame", 0]
+    assert last[-5:].argmax() == last[-5:].tolist().index(last.max()) == 3
+    assert round(float(np.delete(last[-5:], 3).mean() - mean["frame", 0])) == 57  # nobody chose these
+
+
 def test_the_words_on_the_rows_without_the_bar_hold_for_the_records():
     rows = kept_rows()
     blind, shown, base = (official_returns(rows[name]) for name in ("no_bar_frame", "no_bar", "one_round"))
@@ -452,8 +467,8 @@ def test_the_words_on_luck_in_the_searches_hold_for_the_records():
     assert round(1 / float(ttest_ind(*paper).pvalue)) == 17
     assert round(1 / float(ttest_ind(*paper, equal_var=False).pvalue)) == 13
     assert round(1 / float(ttest_rel(*paper).pvalue)) == 5
-    single = [official_returns(rows[f"paper_{variant}"]).mean(axis=1) for variant in ("input", "input_output")]
-    assert [round(1 / float(ttest_ind(paper[0], one).pvalue)) for one in single] == [4, 5]
+    single = official_returns(rows["paper_input_output"]).mean(axis=1)
+    assert round(1 / float(ttest_ind(paper[0], single).pvalue)) == 5
     cases = {pair: round(100 * share) for pair, share in luck.items()}
     assert cases.pop(("finished", "input_output")) == 1 and {min(cases.values()), max(cases.values())} == {6, 8}
     assert sorted(round(1 / share) for (recipe, _), share in luck.items() if recipe == "two_rounds") == [14, 18, 18]
@@ -472,9 +487,8 @@ def test_the_words_on_luck_counted_by_v_hold_for_the_records():
                 trained = variant == "frame", load_json(folder / LOG)["autoencoder"]
                 means.setdefault(trained, []).append(load_json(folder / "evaluation.json")["mean"])
         plain, others = ([np.mean(found) for (own, _), found in means.items() if own == kind] for kind in (True, False))
-        assert max(plain) < min(others) or min(plain) > max(others)
-        told[recipe] = len(plain), len(others), round(1 / float(ttest_ind(plain, others).pvalue))
-    assert told == {"paper": (1, 3, 30), "two_rounds": (2, 3, 38), "finished": (2, 3, 28)}
+        told[recipe] = len(plain), len(others), sum(max(plain) < other for other in others)
+    assert told == {"paper": (1, 3, 2), "two_rounds": (2, 3, 0), "finished": (2, 3, 0)}  # how many are above `frame`
 
 
 def test_the_rule_of_notebook_05_is_no_fair_coin():
