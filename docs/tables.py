@@ -14,6 +14,7 @@ from stad_lab.evaluation import bootstrap
 from stad_lab.plots import plot_claims, to_png
 from stad_lab.rows import ABLATIONS, ROWS
 from stad_lab.table import (
+    RECIPES,
     bootstrap_gain,
     claims_and_outcomes,
     describe_table,
@@ -29,6 +30,24 @@ PICTURE = ROOT / "notebooks" / "pictures" / "claims.png"
 def line(*cells: str) -> str:
     """A line of a table in Markdown."""
     return "| " + " | ".join(cells) + " |"
+
+
+def answer_table(rows: dict[str, list[Path]]) -> str:
+    """What the paper reports of each variant, and what came out here, as the README begins its answer with."""
+    recipes = {told: recipe for recipe, told in RECIPES.items()}
+    scores = claims_and_outcomes(rows)
+    columns = list(scores["frame"])
+    lines = [line("variant", *columns), "|---" * (1 + len(columns)) + "|"]
+    for variant, found in scores.items():
+        cells = []
+        for column in columns:
+            mean, (low, high) = found[column]
+            told = f"{mean:.0f}"
+            if column in recipes:
+                told += f" ({low:.0f} to {high:.0f}; {len(rows[f'{recipes[column]}_{variant}'])})"
+            cells.append(told)
+        lines.append(line(f"`{variant}`", *cells))
+    return "\n".join(lines)
 
 
 def spread_table(rows: dict[str, list[Path]]) -> str:
@@ -94,6 +113,7 @@ def up_to_date(rows: dict[str, list[Path]], label: str) -> dict[Path, str]:
     """The pages as the records, and the alternative text of the picture, want them: file -> text."""
     readme, results = ROOT / "README.md", ROOT / "docs" / "results.md"
     page = put_table(readme.read_text(encoding="utf-8"), describe_table(rows))
+    page = put_table(page, answer_table(rows))
     page = re.sub(r"!\[[^]]*\]\((notebooks/pictures/claims.png)\)", rf"![{label}](\1)", page)
     missing = ", ".join(f"`{name}`" for name in ROWS if name not in rows)
     page = re.sub(r"Not made yet: [^.]*\.", f"Not made yet: {missing}.", page)
