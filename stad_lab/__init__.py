@@ -1,7 +1,7 @@
 """stad_lab: how a car learns a model of its world, drives with it, and dreams in it.
 
 An independent, teachable replication of STAD (Kotyan, Vargas, Venkanna, 2019): World Models on CarRacing, with
-difference images in the auto encoder. Start with the notebooks; `python -m stad_lab --help` is the command line.
+difference images in the autoencoder. Start with the notebooks; `python -m stad_lab --help` is the command line.
 """
 
 import importlib

@@ -1,4 +1,4 @@
-"""V, the difference auto encoder: World Models' variational auto encoder, and the three of the paper (section 3.3).
+"""V, the difference autoencoder: World Models' variational autoencoder, and the three of the paper (section 3.3).
 
     variant        V sees                 V redraws
     frame          frame                  frame                  World Models' own
@@ -307,7 +307,7 @@ def check_part(path: Path, facts: dict, part: str, variant: str | None) -> None:
 
 
 def load_autoencoder(path: Path, variant: str | None = None) -> tuple[AutoEncoder, dict]:
-    """Read V: (the auto encoder in evaluation mode, the facts it was saved with, among them its history).
+    """Read V: (the autoencoder in evaluation mode, the facts it was saved with, among them its history).
 
     Raises:
         FileNotFoundError: no such file.

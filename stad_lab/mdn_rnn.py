@@ -83,7 +83,7 @@ class MDNRNN(nn.Module):
 def log_likelihood(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
     """Logarithm of the density of each entry of `target` (batch, time, latent_size) in nats, of the same shape.
 
-    log sum_k pi_k N(target; mean_k, sigma_k), with the sum inside a logsumexp: densities of latents far from every
+    log sum_k pi_k N(target; mean_k, sigma_k^2), with the sum inside a logsumexp: densities of latents far from every
     mean underflow to zero, their logarithms do not.
     """
     error = (target[..., None] - mixture.mean) * torch.exp(-mixture.logsigma)

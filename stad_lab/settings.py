@@ -43,7 +43,7 @@ class Settings:
     agent_episodes: int = 0
     """Episodes that the agent of an earlier run drives for the dataset, in a second round; 0 in a first one."""
 
-    # V, the auto encoder
+    # V, the autoencoder
     latent_size: int = 32
     """Dimensions of z."""
     width: int = 16
