@@ -63,6 +63,8 @@ def build_parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
     options = build_parser().parse_args(arguments)
+    if hasattr(sys.stdout, "reconfigure"):  # a folder's name may have letters that the console has not
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return options.do(options) or 0
     except (ValueError, OSError, FloatingPointError, TaskError, BrokenProcessPool) as error:

@@ -153,10 +153,13 @@ def drive(
         The returns, float64 (tracks,), and the lengths in frames, int (tracks,).
 
     Raises:
-        ValueError: as `Agent.act_batch`, or fewer than one frame.
+        ValueError: as `Agent.act_batch`, fewer than one frame, or a track below 0.
     """
     if max_frames < 1:
         raise ValueError(f"max_frames={max_frames}: expected at least 1")
+    tracks = [int(track) for track in tracks]  # those of an array are NumPy's, which Gymnasium refuses
+    if min(tracks, default=0) < 0:
+        raise ValueError(f"track {min(tracks)}: expected at least 0, the seeds of tracks")
     unseen = {"bar": False} if fast and agent.crop_bar else {}  # what V crops need not be drawn
     envs = [make_env(fast, **unseen) for _ in tracks]
     observations = [env.reset(seed=track)[0] for env, track in zip(envs, tracks, strict=True)]

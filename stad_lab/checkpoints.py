@@ -9,11 +9,13 @@ import errno
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 from filelock import FileLock, Timeout
 from safetensors.torch import load, save
@@ -42,8 +44,9 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise OSError(f"{folder} is no folder to write to ({error.strerror}): choose another one") from error
     try:
-        for left_over in folder.glob(".*.part"):
-            left_over.unlink(missing_ok=True)
+        for file in folder.glob(".*.part"):
+            if (ours := re.fullmatch(r"\..+\.(\d+)\.part", file.name)) and not psutil.pid_exists(int(ours[1])):
+                file.unlink(missing_ok=True)
         yield
     finally:
         lock.release()
@@ -96,6 +99,8 @@ def check_writable(path: Path) -> None:
     """Raise OSError, before any work, if the file `path` could not be written at its end."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give the name of a file")
+    if path.exists() and not path.is_file():  # a device, which a file would take the place of for everybody
+        raise OSError(f"{path} is no ordinary file: give the name of a file")
     trial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

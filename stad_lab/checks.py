@@ -39,11 +39,13 @@ def check(
 
 
 def to_numpy(value: object) -> np.ndarray:
-    """A number, list, array or tensor as an array; a tensor's gradient is left behind. AssertionError if ragged."""
+    """A number, list, array or tensor as an array; a tensor's gradient is left behind. AssertionError if it is none."""
     try:
         return value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
     except ValueError as error:
         raise AssertionError(f"this is no array, since its parts differ in length ({error})") from error
+    except (RuntimeError, TypeError) as error:  # a list of tensors that keep their gradients, for example
+        raise AssertionError(f"this is no array, and cannot be made one: {error}") from error
 
 
 def agree(found: np.ndarray, other: np.ndarray, tolerance: float) -> bool:

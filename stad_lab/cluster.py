@@ -14,6 +14,8 @@ from distributed import Client, Future, Security
 from distributed.cfexecutor import ClientExecutor
 from distributed.comm import get_address_host_port, parse_address
 
+from stad_lab.parallel import task_errors
+
 PATIENCE = 60.0  # seconds to wait for a scheduler to answer and for its first worker
 SAME = ("stad_lab", "torch", "numpy", "gymnasium", "box2d", "opencv-python-headless")  # or the numbers would differ
 
@@ -26,14 +28,17 @@ class ClusterExecutor(ClientExecutor):
 
         It is the result of a task, not data that was put there, so it comes back if the workers that held it are lost.
         All workers get it at once, because Dask prefers to send a task to where its arguments are.
+
+        Raises:
+            TaskError: the scheduler is lost, or all workers are.
         """
-        with warnings.catch_warnings():
+        once = {"allow_other_workers": True, "pure": False}  # another one may do it if that one is lost before it could
+        with warnings.catch_warnings(), task_errors("what workers share"):
             warnings.filterwarnings("ignore", "Sending large graph")  # once for each run, not for each task
-            stand_in, fetched = self._client.submit(itself, value, pure=False), []
-        for worker in self._client.nthreads():  # another one may do it if that one is lost before it could
-            fetched.append(self._client.submit(fetch, stand_in, workers=[worker], allow_other_workers=True, pure=False))
-        for future in fetched:
-            future.result()
+            stand_in = self._client.submit(itself, value, pure=False)
+            fetched = [self._client.submit(fetch, stand_in, workers=[one], **once) for one in self._client.nthreads()]
+            for future in fetched:
+                future.result()
         return stand_in
 
 
@@ -88,7 +93,7 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
             yield ClusterExecutor(client, pure=False)
         finally:
             if managed:
-                with suppress(OSError):  # a scheduler that is lost by now
+                with suppress(Exception):  # whatever Dask raises if the scheduler, or by now the client, is lost
                     client.amm.start()
 
 

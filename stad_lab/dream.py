@@ -134,10 +134,12 @@ def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0)
         The dreamed frames, uint8 (frames, 64, 64, 3), and the actions, float32 (frames, 3).
 
     Raises:
-        ValueError: the agent has not acted since its last reset, or drives several cars.
+        ValueError: the agent has not acted since its last reset, or drives several cars; or fewer than one frame.
     """
     if agent.state is None:
         raise ValueError("the agent has not acted yet: let it drive a few real frames, then dream on")
+    if frames < 1:
+        raise ValueError(f"frames={frames}: expected at least 1")
     if len(agent.cars) != 1:
         raise ValueError(
             f"the agent drives {len(agent.cars)} cars: expected one, so go on with agent.keep(np.array([0]))"

@@ -61,14 +61,10 @@ def evaluate(
             f"episodes={episodes} from first_track={first_track}: expected at least 1 episode, on tracks"
             f" {low} to {high - 1}; those above are for training and validation"
         )
-    agent = load_agent(variant, path)
-    folder = run_folder(variant, path)
-    # The checksum now, since a search may find a better one meanwhile.
-    identity = {
-        "variant": variant,
-        "renderer": "fast" if fast else "official",
-        "controller_sha256": checksum((folder / CONTROLLER).read_bytes()),
-    }
+    agent, folder, read = load_agent(variant, path), run_folder(variant, path), None
+    while read != (now := checksum((folder / CONTROLLER).read_bytes())):  # a search may save a better one meanwhile
+        agent, read = load_agent(variant, path), now
+    identity = {"variant": variant, "renderer": "fast" if fast else "official", "controller_sha256": read}
     tracks = list(range(first_track, first_track + episodes))
     known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
     asked = identity | {"tracks": tracks}

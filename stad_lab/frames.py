@@ -58,11 +58,19 @@ def difference_image(frame: np.ndarray, earlier: np.ndarray) -> np.ndarray:
     return (frame.astype(np.float32) - earlier.astype(np.float32)) / 255
 
 
+def check_stride(stride: int) -> None:
+    """Raise ValueError unless a stride is at least 1: every frame minus itself is zero, and the future is not known."""
+    if stride < 1:
+        raise ValueError(f"stride={stride}: expected at least 1 frame")
+
+
 def earlier_index(index: np.ndarray | int, stride: int) -> np.ndarray:
     """The frame to subtract from frame `index` of an episode: `stride` before it, or itself in the first frames.
 
-    Until `stride` frames exist the car is taken not to have moved, so its difference image is zero.
+    Until `stride` frames exist the car is taken not to have moved, so its difference image is zero. Raises ValueError
+    for a stride below 1.
     """
+    check_stride(stride)
     index = np.asarray(index)
     return np.where(index >= stride, index - stride, index)
 
@@ -84,6 +92,7 @@ class FrameMemory:
     """
 
     def __init__(self, stride: int):
+        check_stride(stride)
         self.frames: deque[np.ndarray] = deque(maxlen=stride + 1)
 
     def keep(self, cars: np.ndarray) -> None:

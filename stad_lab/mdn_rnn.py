@@ -156,7 +156,7 @@ def sequence_batch(
     Raises:
         ValueError: no episode is longer than `length`.
     """
-    long_enough = long_episodes(encoded, length)
+    long_enough = long_episodes([episode.shape[1] for episode in encoded], length)
     latents, chosen_actions = [], []
     for index in rng.choice(long_enough, batch):
         mu, logvar = encoded[index]
@@ -168,17 +168,18 @@ def sequence_batch(
     return torch.from_numpy(np.stack(latents)), torch.from_numpy(np.stack(chosen_actions))
 
 
-def long_episodes(encoded: list[np.ndarray], length: int, which: str = "") -> list[int]:
+def long_episodes(lengths: list[int], length: int, which: str = "") -> list[int]:
     """Indices of the episodes with more than `length` frames; raises ValueError if there are none.
 
     Args:
+        lengths: of the episodes, in frames.
         which: what the message calls the episodes, for example "held-out ".
     """
-    found = [index for index, episode in enumerate(encoded) if episode.shape[1] > length]
+    found = [index for index, frames in enumerate(lengths) if frames > length]
     if not found:
-        longest = max(episode.shape[1] for episode in encoded)
         raise ValueError(
-            f"m_sequence={length}, but the longest {which}episode has {longest} frames: use shorter sequences"
+            f"m_sequence={length}, but the longest {which}episode has {max(lengths)} frames: use shorter sequences, in"
+            " another folder"
         )
     return found
 
@@ -211,9 +212,19 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     torch.manual_seed(settings.seed)
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)
-    encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
+    encoded = []
+    if settings.m_steps:
+        check_lengths(rollouts, settings)  # before V encodes them all
+        encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
     fit_mdn_rnn(path, mdn_rnn, variant, v_facts["identity"], encoded, rollouts.actions, rollouts, settings)
     return True
+
+
+def check_lengths(rollouts: Rollouts, settings: Settings) -> None:
+    """Raise ValueError unless there is a training episode, and a held-out one, that holds a whole sequence."""
+    lengths, first_heldout = np.bincount(rollouts.episode).tolist(), rollouts.episode[rollouts.split()[1][0]]
+    long_episodes(lengths[:first_heldout], settings.m_sequence, "training ")
+    long_episodes(lengths[first_heldout:], settings.m_sequence, "held-out ")
 
 
 def fit_mdn_rnn(
@@ -249,8 +260,7 @@ def fit_mdn_rnn(
         return {"total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))["total"].item()}
 
     if settings.m_steps:
-        long_episodes(encoded[:first_heldout], settings.m_sequence, "training ")
-        long_episodes(encoded[first_heldout:], settings.m_sequence, "held-out ")
+        check_lengths(rollouts, settings)
     checkpoint = checkpoint_of(path)
     identity = {"part": "mdn_rnn", "variant": variant, "autoencoder": v_identity, "rollouts": rollouts.identity}
     identity |= settings.as_dict()

@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -104,16 +104,19 @@ class WorkerProcesses(Executor):
         try:
             # Without our lock: a pool that breaks calls `_end` while it holds its own, which this wants (Python 3.12).
             attempt = pool.submit(work)
-        except BrokenProcessPool as error:  # it broke a moment ago
+        except Exception as error:  # it broke a moment ago, or no process can be started
             attempt = Future()
             attempt.set_exception(error)
         attempt.add_done_callback(functools.partial(self._end, task, work, pool))
 
     def _end(self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future) -> None:
         error = BrokenProcessPool("the workers were stopped") if attempt.cancelled() else attempt.exception()
-        if isinstance(error, BrokenProcessPool) and not self.closed.is_set() and self._replace(pool):
-            self._begin(task, work)
-            return
+        try:
+            if isinstance(error, BrokenProcessPool) and not self.closed.is_set() and self._replace(pool):
+                self._begin(task, work)
+                return
+        except Exception as failed:  # there are no more processes or files to be had: nobody else would be told
+            error = failed
         with self.lock:
             self.unfinished -= 1
             self.silence = 0.0
@@ -188,26 +191,38 @@ def run_tasks(
         TaskError: a task failed otherwise, or no task was finished for `time_limit` seconds.
     """
     to_begin, waiting = enumerate(tasks), {}
+    name = getattr(getattr(function, "func", function), "__name__", function)  # a partial has none
     try:
         while True:
             for number, task in itertools.islice(to_begin, (ahead or len(tasks)) - len(waiting)):
-                waiting[executor.submit(function, *task)] = number
+                with task_errors(name):
+                    waiting[executor.submit(function, *task)] = number
             if not waiting:
                 return
             done = finished_first(waiting, time_limit)
             while done:  # emptied, so that nobody holds on to a result
                 number = waiting.pop(future := done.pop())
-                try:
+                with task_errors(name):
                     result = future.result()
-                except (ValueError, OSError):
-                    raise
-                except Exception as error:
-                    name = getattr(getattr(function, "func", function), "__name__", function)  # a partial has none
-                    raise TaskError(f"{name} failed in a worker: {type(error).__name__}: {error}") from error
                 yield number, result
     finally:
         for future in waiting:
             future.cancel()
+
+
+@contextmanager
+def task_errors(name: str) -> Iterator[None]:
+    """Turn what goes wrong with a task called `name` into a TaskError, but for ValueError and OSError."""
+    try:
+        yield
+    except (ValueError, OSError):
+        raise
+    except CancelledError as error:
+        raise TaskError(
+            f"{name} was cancelled, as when a scheduler is lost: see that it runs, and the same command goes on"
+        ) from error
+    except Exception as error:
+        raise TaskError(f"{name} failed in a worker: {type(error).__name__}: {error}") from error
 
 
 def finished_first(waiting: Iterable[Future], time_limit: float) -> set[Future]:

@@ -16,6 +16,7 @@ The folder of a run::
 """
 
 import importlib.metadata
+import itertools
 import os
 import platform
 import shlex
@@ -173,7 +174,7 @@ def open_record(folder: Path, variant: str, settings: Settings, command: str, be
             run, or from the same when it was less far.
     """
     path = folder / "record.json"
-    if not path.exists():
+    if not path.exists() or is_empty_run(folder):
         record = {
             "variant": variant,
             "settings": settings.as_dict(),
@@ -199,6 +200,13 @@ def open_record(folder: Path, variant: str, settings: Settings, command: str, be
     if made != starts(record)[-1]:
         record["continued_with"] = [*starts(record)[1:], made]
     return record | {"settings": settings.as_dict()}
+
+
+def is_empty_run(folder: Path) -> bool:
+    """Whether a folder holds nothing but the record of a run that was refused before it made anything."""
+    files = (file for file in folder.rglob("*") if file.is_file() and not file.name.startswith("."))
+    found = [file.name for file in itertools.islice(files, 2)]
+    return found == ["record.json"] and load_json(folder / "record.json").get("seconds") == {}
 
 
 def what_counts(record: dict | None) -> dict | None:

@@ -224,6 +224,12 @@ class EpisodeFrames(Sequence):
                     raise ValueError(f"{self.paths[index]} is shorter than it was: collect in another folder")
 
 
+def count_episodes(manifest: dict) -> tuple[int, int]:
+    """How many episodes a manifest lists, and how many there are to be."""
+    made_with = manifest["settings"]
+    return len(manifest["blocks"]), made_with["episodes"] + made_with.get("agent_episodes", 0)
+
+
 def identity_of(manifest: dict) -> str:
     """The checksum of a whole dataset."""
     return checksum(json.dumps(manifest["blocks"]).encode())
@@ -258,8 +264,7 @@ class Rollouts:
         self.folder = Path(folder)
         remedy = f"collect the rollouts first: python -m stad_lab train ... --rollouts {self.folder}"
         self.manifest = load_json(self.folder / MANIFEST, remedy)
-        made_with = self.manifest["settings"]
-        found, wanted = len(self.manifest["blocks"]), made_with["episodes"] + made_with.get("agent_episodes", 0)
+        found, wanted = count_episodes(self.manifest)
         if found != wanted:
             raise ValueError(f"{self.folder} holds {found} of {wanted} episodes: {remedy}")
         blocks = self.manifest["blocks"]

@@ -27,7 +27,7 @@ from stad_lab.evolution import (
 from stad_lab.mdn_rnn import load_mdn_rnn
 from stad_lab.parallel import TaskError, run_in_order, worker_processes
 from stad_lab.pipeline import GIVE_A_RUN, MACHINE, PACKAGES, provenance, starts
-from stad_lab.rollouts import Rollouts, check_seen
+from stad_lab.rollouts import MANIFEST, Rollouts, check_seen, count_episodes
 from stad_lab.search_space import search_space
 from stad_lab.settings import Settings
 
@@ -94,8 +94,11 @@ def other_machine(made_with: dict, here: dict) -> str:
 
 def verify_rollouts(folder: Path) -> str:
     """Check every block against the manifest."""
-    if not folder.is_dir():
+    if not (folder / MANIFEST).exists():
         return f"none: {NOT_HERE}"
+    made, wanted = count_episodes(load_json(folder / MANIFEST))
+    if made < wanted:
+        return f"none: {made} of {wanted} episodes so far"
     rollouts = Rollouts(folder)
     return f"ok: {len(rollouts.frames)} episodes, {len(rollouts)} frames"
 

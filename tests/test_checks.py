@@ -53,6 +53,11 @@ def test_answers_that_are_not_finite_are_told_what_is_wrong(found, expected, mes
         check("f(x)", np.array(found), np.array(expected))
 
 
+def test_a_list_of_tensors_that_keep_their_gradients_is_told_so():
+    with pytest.raises(AssertionError, match=r"this is no array, and cannot be made one: .*requires grad"):
+        check("the answer", [torch.ones(2, requires_grad=True)], [[1.0, 1.0]])
+
+
 def test_a_list_of_unequal_parts_is_told_so():
     with pytest.raises(AssertionError, match="parts differ in length"):
         check("f(x)", [[1, 2], [3]], [[1, 2], [3, 4]])

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from stad_lab.checkpoints import load_json
 from stad_lab.cluster import check_address, check_versions, cluster, versions
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import evolve
+from stad_lab.parallel import TaskError, run_tasks
 from stad_lab.rollouts import collect_rollouts
 from stad_lab.settings import Settings
 
@@ -153,6 +155,37 @@ def busy(executor):
     """The names of the workers that have a task."""
     names = {address: worker["name"] for address, worker in executor._client.scheduler_info()["workers"].items()}
     return [names[address] for address, tasks in executor._client.processing().items() if tasks and address in names]
+
+
+def test_a_lost_scheduler_is_told_in_one_line_and_does_not_hide_what_was_done():
+    lost = LocalCluster(n_workers=1, processes=False, protocol="tcp://", dashboard_address=None)
+    with lost, cluster(lost.scheduler_address) as executor:  # and to leave this block raises nothing
+        executor._client.close()  # as it does by itself, a minute after it has lost its scheduler
+        with pytest.raises(TaskError, match="what workers share failed in a worker: ClosedClientError"):
+            executor.share(b"V and M")
+        with pytest.raises(TaskError, match="int failed in a worker: ClosedClientError"):
+            list(run_tasks(executor, int, [()]))
+
+
+def test_a_task_that_is_cancelled_from_outside_is_told_with_the_remedy():
+    with cancelling_executor() as executor, pytest.raises(TaskError, match="sleep was cancelled, as when a scheduler"):
+        list(run_tasks(executor, time.sleep, [(1,)]))
+
+
+@contextmanager
+def cancelling_executor():
+    """An executor that cancels every task, as Dask does with those of a lost scheduler."""
+    with ThreadPoolExecutor(1) as executor:
+        executor.submit(time.sleep, 0.2)  # keeps it busy, so that the next one can be cancelled
+        submit = executor.submit
+        executor.submit = lambda *task: cancelled(submit(*task))
+        yield executor
+
+
+def cancelled(future):
+    """A future, cancelled."""
+    assert future.cancel()
+    return future
 
 
 def test_an_address_without_a_scheduler_is_an_error_that_says_how_to_start_one():

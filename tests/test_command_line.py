@@ -2,12 +2,15 @@
 
 import dataclasses
 import importlib.metadata
+import io
 import json
+import os
 import re
 import shlex
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -241,6 +244,31 @@ def test_a_result_is_written_where_it_is_wanted_and_not_over_a_folder(run, tmp_p
     capsys.readouterr()
     error = the_error(capsys, [*evaluate_quickly(run), "--json", wanted.parent])
     assert "is a folder: give the name of a file" in error
+    if hasattr(os, "mkfifo"):  # a device would be replaced by a file, for every program on the machine
+        os.mkfifo(tmp_path / "device")
+        error = the_error(capsys, [*evaluate_quickly(run), "--json", tmp_path / "device"])
+        assert "is no ordinary file: give the name of a file" in error and (tmp_path / "device").is_fifo()
+
+
+def test_a_start_that_was_refused_may_be_made_again_with_other_settings(tmp_path, monkeypatch, capsys):
+    command = ["train", "--variant", "frame", "--settings", "quick", "--until", "rollouts", "--out", str(tmp_path)]
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
+    assert "collect fewer or shorter episodes" in the_error(capsys, command)
+    monkeypatch.undo()
+    fewer = [*command, "--set", "episodes=2"]
+    assert main(fewer) == 0
+    assert load_json(tmp_path / "record.json")["settings"]["episodes"] == 2
+    capsys.readouterr()
+    assert "choose another folder" in the_error(capsys, command)  # now there is something to lose
+
+
+def test_a_folder_whose_letters_the_console_lacks_is_no_error(quick_run, tmp_path, monkeypatch):
+    run = shutil.copytree(quick_run, tmp_path / "\u0141\u00f3d\u017a")
+    console = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr(sys, "stdout", console)
+    assert main(["train", "--variant", "input_output", "--settings", "quick", "--out", str(run)]) == 0
+    console.flush()
+    assert b"nothing to do" in console.buffer.getvalue() and b"\\u0141" in console.buffer.getvalue()
 
 
 def test_an_unknown_variant_ends_in_one_clear_line(tmp_path, command_line):

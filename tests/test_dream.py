@@ -162,6 +162,13 @@ def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
         dream_on(agent, 5)
 
 
+def test_a_dream_of_no_frame_is_refused(agent, observations):
+    agent.reset()
+    agent.act(observations[0])
+    with pytest.raises(ValueError, match="frames=0: expected at least 1"):
+        dream_on(agent, 0)
+
+
 def test_one_car_dreams_on_with_its_own_c_and_several_cannot(agent, observations):
     rows = np.stack([agent.parameters, -agent.parameters])
     many, alone = (Agent(agent.autoencoder, agent.mdn_rnn, c, agent.stride, agent.crop_bar) for c in (rows, rows[1]))

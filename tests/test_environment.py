@@ -8,6 +8,8 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
+import torch
 
 from stad_lab import check_environment, environment
 from stad_lab.agent import PRETRAINED
@@ -134,13 +136,30 @@ def test_a_gpu_that_is_too_old_for_this_pytorch_is_amber_and_not_trained_on(monk
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Tesla V100")
     monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["sm_90a", "sm_75", "sm_100", "compute_120"])
     monkeypatch.setattr("torch.ones", refuse)
-    for capability, state in (((7, 0), "amber"), ((7, 5), "green"), ((12, 0), "green")):
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (7, 0))
+    (gpu,) = environment.check_gpu()
+    assert gpu.state == "amber" and "Tesla V100 is too old for this PyTorch" in gpu.found
+    assert training_device().type == "cpu" and "no kernel image" in capsys.readouterr().err
+    monkeypatch.setattr("torch.ones", lambda *given, device: torch.zeros(1))
+    for capability in ((7, 5), (12, 0)):
         monkeypatch.setattr("torch.cuda.get_device_capability", lambda found=capability: found)
         (gpu,) = environment.check_gpu()
-        assert gpu.state == state and "Tesla V100" in gpu.found
+        assert gpu.state == "green" and "Tesla V100" in gpu.found
     monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["gfx906"])  # of another maker
     assert [line.state for line in environment.check_gpu()] == ["green"]
-    assert training_device().type == "cpu" and "no kernel image" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("refusing", ["torch.ones", "torch.cuda.get_device_name"])
+def test_a_gpu_that_another_process_has_taken_is_amber_because_none_is_needed(refusing, monkeypatch):
+    def refuse(*given, **named):
+        raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "A100")
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (8, 0))
+    monkeypatch.setattr(refusing, refuse)
+    (gpu,) = environment.check_gpu()
+    assert gpu.state == "amber" and "busy" in gpu.found and "none is needed" in gpu.remedy
 
 
 def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):

@@ -8,6 +8,7 @@ import pytest
 
 from stad_lab import load_agent
 from stad_lab.__main__ import main
+from stad_lab.agent import load_controller, save_controller
 from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import describe, evaluate, summarise
 from stad_lab.parallel import run_tasks
@@ -79,6 +80,26 @@ def test_a_result_names_the_controller_that_drove_if_a_search_finds_a_better_one
 
     monkeypatch.setattr("stad_lab.evaluation.run_tasks", find_a_better_one)
     assert evaluate("input_output", run, episodes=1)["controller_sha256"] == checksum(drove)
+
+
+def test_a_controller_that_changes_while_it_is_read_is_read_again(straight_run, tmp_path, monkeypatch):
+    run, readings = shutil.copytree(straight_run, tmp_path / "run"), []
+    file = run / "controller.safetensors"
+    old = load_controller(file, "input_output")
+
+    def read_and_save_a_better_one(*given):
+        agent = load_agent(*given)
+        if len(readings) < 2:  # the first reading, and the one between the two checksums
+            save_controller(file, old[0] + len(readings) + 1, **{k: v for k, v in old[1].items() if k != "part"})
+        readings.append(agent.parameters)
+        return agent
+
+    monkeypatch.setattr("stad_lab.evaluation.load_agent", read_and_save_a_better_one)
+    driven = []
+    monkeypatch.setattr("stad_lab.evaluation.run_tasks", lambda *given: driven.append(given[2]) or [(0, ([1.0], [7]))])
+    found = evaluate("input_output", run, episodes=1)
+    assert found["controller_sha256"] == checksum(file.read_bytes())
+    assert np.array_equal(driven[0][0][2], load_controller(file, "input_output")[0])
 
 
 def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straight_run, fast, tmp_path, monkeypatch):

@@ -24,12 +24,12 @@ from stad_lab.checkpoints import load_json, load_tensors, save_json, write_bytes
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
-from stad_lab.parallel import TaskError, run_tasks, worker_processes
+from stad_lab.parallel import TaskError, WorkerProcesses, run_tasks, worker_processes
 from stad_lab.pipeline import STAGES, provenance, train
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
 from stad_lab.table import RECORDS
-from stad_lab.verify import verify
+from stad_lab.verify import verify, verify_rollouts
 
 KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # on Windows, SIGTERM ends a process at once
 VARIANT, SETTINGS = "input_output", Settings.preset("quick")
@@ -288,10 +288,13 @@ def test_a_stage_killed_at_twenty_random_moments_ends_with_the_same_bits(stage, 
 
 def test_half_written_files_of_a_killed_process_are_cleared_away(quick_run, tmp_path, in_this_process):
     folder = start_of("controller", quick_run, tmp_path / "run")
-    left_over = folder / ".evolution.json.12345.part"
-    left_over.write_bytes(b"{")
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    left_over, others = folder / f".evolution.json.{ended.pid}.part", [".thesis.zip.part", f".log.{os.getppid()}.part"]
+    for name in (left_over.name, *others):
+        (folder / name).write_bytes(b"{")
     evolve(VARIANT, SETTINGS, folder, in_this_process)
-    assert not left_over.exists()
+    assert not left_over.exists() and all((folder / name).exists() for name in others)  # somebody's, or still written
 
 
 # Workers
@@ -331,6 +334,16 @@ def test_work_of_a_stuck_worker_is_done_again(tmp_path, capfd):
     with worker_processes(1, time_limit=3) as executor:
         assert dict(run_tasks(executor, hang_once, [(tmp_path / "marker", 7)])) == {0: 7}
     assert "they are stuck" in capfd.readouterr().err
+
+
+def test_a_lost_worker_for_whom_there_is_no_new_one_is_told_at_once(monkeypatch):
+    def refuse(self):
+        raise OSError(24, "Too many open files")
+
+    with worker_processes(1) as executor:
+        monkeypatch.setattr(WorkerProcesses, "_new_pool", refuse)
+        with pytest.raises(OSError, match="Too many open files"):
+            list(run_tasks(executor, always_die, [()] * 3, time_limit=60))
 
 
 def test_work_that_kills_every_worker_ends_in_an_error():
@@ -490,6 +503,15 @@ def test_verify_drives_recorded_episodes_again(quick_run, capsys):
     assert found["log"] == "ok: 4 generations lead to the same mean"
     assert re.fullmatch(r"ok: .* points, to the last bit as recorded", found["drives"])
     assert not any(outcome.startswith("FAILED") for outcome in found.values())
+
+
+def test_verify_says_of_a_collection_that_was_stopped_how_far_it_is(quick_run, tmp_path):
+    folder = shutil.copytree(quick_run / "rollouts", tmp_path / "rollouts")
+    manifest = load_json(folder / "manifest.json")
+    save_json(folder / "manifest.json", manifest | {"blocks": manifest["blocks"][:3]})
+    assert verify_rollouts(folder) == f"none: 3 of {SETTINGS.episodes} episodes so far"
+    (folder / "manifest.json").unlink()
+    assert verify_rollouts(folder).startswith("none: ")
 
 
 def test_verify_finds_a_return_that_no_drive_gives(quick_run, tmp_path, in_this_process, capsys):

@@ -5,7 +5,14 @@ import numpy as np
 import pytest
 
 from stad_lab.car_racing import BAR_TOP
-from stad_lab.frames import FrameMemory, difference_image, earlier_index, episode_differences, to_frame
+from stad_lab.frames import (
+    FrameMemory,
+    difference_image,
+    earlier_frames,
+    earlier_index,
+    episode_differences,
+    to_frame,
+)
 
 
 def random_frames(count, seed=0):
@@ -56,6 +63,13 @@ def test_differences_are_zero_until_stride_frames_exist(stride):
     assert not differences[:stride].any()
     for t in range(stride, 8):
         assert np.array_equal(differences[t], difference_image(frames[t], frames[t - stride]))
+
+
+@pytest.mark.parametrize("stride", [0, -1])
+def test_a_stride_that_looks_at_the_present_or_the_future_is_refused(stride):
+    for use in (FrameMemory, lambda stride: earlier_frames(np.zeros((9, 2, 2, 3), np.uint8), stride)):
+        with pytest.raises(ValueError, match=f"stride={stride}: expected at least 1 frame"):
+            use(stride)
 
 
 def test_an_episode_of_1000_frames_has_996_difference_images():
