@@ -14,7 +14,6 @@ from stad_lab.evaluation import bootstrap
 from stad_lab.plots import plot_claims, to_png
 from stad_lab.rows import ABLATIONS, ROWS
 from stad_lab.table import (
-    RECIPES,
     bootstrap_gain,
     claims_and_outcomes,
     describe_table,
@@ -34,18 +33,14 @@ def line(*cells: str) -> str:
 
 def answer_table(rows: dict[str, list[Path]]) -> str:
     """What the paper reports of each variant, and what came out here, as the README begins its answer with."""
-    recipes = {told: recipe for recipe, told in RECIPES.items()}
     scores = claims_and_outcomes(rows)
     columns = list(scores["frame"])
     lines = [line("variant", *columns), "|---" * (1 + len(columns)) + "|"]
     for variant, found in scores.items():
         cells = []
         for column in columns:
-            mean, (low, high) = found[column]
-            told = f"{mean:.0f}"
-            if column in recipes:
-                told += f" ({low:.0f} to {high:.0f}; {len(rows[f'{recipes[column]}_{variant}'])})"
-            cells.append(told)
+            mean, (low, high), searches = found[column]
+            cells.append(f"{mean:.0f}" + f" ({low:.0f} to {high:.0f}; {len(searches)})" * bool(searches))
         lines.append(line(f"`{variant}`", *cells))
     return "\n".join(lines)
 

@@ -232,10 +232,40 @@ def plot_intervals(
     return figure
 
 
-def plot_claims(scores: dict[str, dict[str, tuple[float, list[float]]]]) -> Figure:
-    """What the paper reports of each variant beside what came out here: `table.claims_and_outcomes`."""
-    title = "Claimed and found: mean return on 100 tracks, ours with its 95% interval"
-    return plot_intervals({"": scores}, title, "return", columns=1)
+def plot_claims(scores: dict[str, dict[str, tuple[float, list[float], list[float]]]]) -> Figure:
+    """What the paper reports of each variant beside what came out here: `table.claims_and_outcomes`.
+
+    A dot is a mean, with its interval; a short line through it is one search. The second panel is a close-up.
+    """
+    names = list(next(iter(scores.values())))
+    figure, ((whole, close),) = new_figure(9.0, 3.4, 1, 2, sharey=True, gridspec_kw={"width_ratios": [3, 2]})
+    for axis, (place, found) in itertools.product((whole, close), enumerate(scores.values())):
+        for name, color, shift in zip(names, COLORS, np.linspace(-0.27, 0.27, len(names)), strict=False):
+            if name in found:
+                mean, interval, searches = found[name]
+                axis.plot(interval, [place + shift] * 2, color=color, lw=2, alpha=0.4)
+                axis.plot(searches, [place + shift] * len(searches), "|", color=color, ms=8, mew=1.5)
+                axis.plot(mean, place + shift, "o" if searches else "D", color=color, ms=5)
+    whole.set(yticks=range(len(scores)), yticklabels=list(scores), ylim=(len(scores) - 0.5, -0.5))
+    close.set_xlim(870, 930)
+    for axis, panel in ((whole, "all"), (close, "close up")):
+        axis.set_title(panel, fontsize=9)
+        axis.set_xlabel("return", fontsize=9)
+        axis.grid(axis="x", color="0.9")
+    handles = [
+        whole.plot([], [], "D" if name == names[0] else "o", color=color)[0]
+        for name, color in zip(names, COLORS, strict=False)
+    ]
+    figure.legend(handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9)
+    title = "Claimed and found: mean return on 100 tracks, ours with its 95% interval and its searches"
+    figure.suptitle(title, fontsize=11)
+    told = [
+        f"{variant} {name} {mean:.0f}" + (f" (searches {', '.join(f'{own:.0f}' for own in searches)})" * bool(searches))
+        for variant, found in scores.items()
+        for name, (mean, _, searches) in found.items()
+    ]
+    figure.set_label(f"{title}. {'; '.join(told)}.")
+    return figure
 
 
 def plot_stacks(stacks: dict[str, dict[str, float]], title: str, xlabel: str) -> Figure:
