@@ -291,3 +291,15 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
     save_autoencoder(tmp_path / "v.safetensors", autoencoder, Settings(), [])
     with pytest.raises(ValueError, match=r"v.safetensors holds values that are not finite in 'encoder.0.bias': train"):
         load_autoencoder(tmp_path / "v.safetensors")
+
+
+def test_v_does_not_go_on_with_other_rollouts(quick_run, tmp_path, interrupt_after):
+    settings = Settings.preset("quick", v_steps=20)
+    interrupt_after(5)
+    with pytest.raises(KeyboardInterrupt):
+        train_autoencoder("frame", settings, quick_run / "rollouts", tmp_path / "run")
+    other = shutil.copytree(quick_run / "rollouts", tmp_path / "other")
+    manifest = load_json(other / "manifest.json")
+    save_json(other / "manifest.json", manifest | {"blocks": manifest["blocks"][::-1]})
+    with pytest.raises(ValueError, match="holds a run with rollouts="):
+        train_autoencoder("frame", settings, other, tmp_path / "run")

@@ -17,6 +17,7 @@ from stad_lab.drives import (
     road_in_sight,
     true_motion,
 )
+from stad_lab.mdn_rnn import encode_frames
 from stad_lab.rollouts import TRACK_RANGES, drive_randomly, track_seeds
 from stad_lab.settings import Settings
 
@@ -119,3 +120,16 @@ def test_m_s_memory_before_a_frame_does_not_know_it(agent, random_drive):
     after = remember_drive(agent.mdn_rnn, changed, random_drive.actions)
     assert np.array_equal(hidden[:21], after[:21]) and not np.allclose(hidden[21], after[21])
     assert torch.count_nonzero(torch.from_numpy(hidden[0])) == 0
+
+
+def test_an_agent_can_be_recorded_twice(agent):
+    first, again = (record_drive(agent, track=4, frames=8) for _ in range(2))
+    assert np.array_equal(first.actions, again.actions)
+
+
+def test_a_drive_for_inspection_shows_the_bar_and_v_sees_it_as_it_was_trained(agent):
+    drive = record_random_drive(Settings.preset("quick", seed=3, random_starts=1.0), 0)
+    assert drive.observations[:, 84:].any(axis=(1, 2, 3)).all()
+    for crop_bar in (True, False):
+        mu, _ = encode_drive(agent.autoencoder, drive, 2, crop_bar)
+        assert np.array_equal(mu, encode_frames(agent.autoencoder, drive.frames(crop_bar), 2)[0])

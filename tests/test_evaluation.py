@@ -1,12 +1,13 @@
 """Evaluation: official tracks, every episode on record, numbers that a script of one's own finds again."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import gymnasium
 import numpy as np
 import pytest
 
-from stad_lab import load_agent
+from stad_lab import load_agent, make_env
 from stad_lab.__main__ import main
 from stad_lab.agent import load_controller, save_controller
 from stad_lab.checkpoints import checksum, load_json, save_json
@@ -163,3 +164,12 @@ def test_tracks_outside_the_test_range_are_refused(first, episodes, straight_run
     message = f"episodes={episodes} from first_track={first}: expected at least 1 episode, on tracks 0 to 999999"
     with pytest.raises(ValueError, match=message):
         evaluate("input_output", straight_run, episodes, first)
+
+
+def test_official_means_gymnasium_s_own_environment(straight_run, monkeypatch):
+    made = []
+    monkeypatch.setattr("stad_lab.agent.make_env", lambda fast=True, **how: made.append(fast) or make_env(True, **how))
+    with ThreadPoolExecutor(1) as executor:
+        for fast in (False, True):
+            evaluate("input_output", straight_run, 1, 3, fast, executor=executor)
+    assert made == [False, True]

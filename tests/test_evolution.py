@@ -1,5 +1,6 @@
 """CMA-ES over C: a log of every generation, and an interrupt that changes nothing."""
 
+import itertools
 import json
 import os
 import shutil
@@ -23,6 +24,7 @@ from stad_lab.evolution import (
     ask,
     averaged_mean,
     drive_generation,
+    drive_parallel,
     evolve,
     fitness_curves,
     generation_tracks,
@@ -443,3 +445,33 @@ def test_a_damaged_controller_is_not_taken_for_a_finished_run(one_go, tmp_path):
     file.write_bytes(file.read_bytes()[:-10])
     with pytest.raises(ValueError, match=r"controller.safetensors is damaged"):
         evolve("input_output", settings(), folder)
+
+
+def test_a_look_is_the_mean_of_its_returns_on_the_same_tracks_for_every_seed(monkeypatch):
+    asked, found = [], (np.array([0.0, 100.0, 800.0]), np.array([50, 60, 70]))
+    monkeypatch.setattr("stad_lab.evolution.drive_parallel", lambda *given: asked.append(given) or found)
+    for seed in (0, 1):
+        chosen = Settings.preset("quick", validation_tracks=3, seed=seed, evolution_seed=seed)
+        look = validate(None, None, "input", chosen, np.zeros(9))
+        assert (look["mean"], look["returns"], look["frames"]) == (300.0, [0.0, 100.0, 800.0], 180)
+    assert asked[0][4] == asked[1][4]
+
+
+def test_a_generation_counts_every_frame_of_every_agent_on_every_track(monkeypatch):
+    monkeypatch.setattr("stad_lab.evolution.drive_parallel", lambda *given: (np.arange(8.0), np.arange(8)))
+    entry = drive_generation(None, None, "input", Settings.preset("quick", tracks=2), [], np.zeros((4, 9)))
+    assert entry["frames"] == 28 and entry["returns"] == [[0, 1], [2, 3], [4, 5], [6, 7]]
+
+
+def test_the_groups_of_cars_do_not_depend_on_the_processes(monkeypatch):
+    sizes = []
+
+    def run(executor, function, tasks):
+        sizes.append([len(task[3]) for task in tasks])
+        return [(np.zeros(len(task[3])),) * 2 for task in tasks]
+
+    monkeypatch.setattr("stad_lab.evolution.run_in_order", run)
+    for processes, tracks in itertools.product((1, 2, 5), (3, 9)):
+        chosen = Settings.preset("quick", processes=processes, cars=4)
+        drive_parallel(None, None, "input", np.zeros((tracks, 3)), list(range(tracks)), chosen)
+    assert sizes == [[2, 1], [4, 4, 1]] * 3

@@ -1,5 +1,6 @@
 """Broken files, broken machines and impatient people: nothing is lost, nothing is used that is not whole."""
 
+import dataclasses
 import errno
 import os
 import random
@@ -592,3 +593,26 @@ def test_a_run_uses_no_network_and_writes_only_into_its_folder(quick_training):
     assert "forbidden" not in process.stderr
     names = {"rollouts", "autoencoder.safetensors", "mdn_rnn.safetensors", "evolution.json", "controller.safetensors"}
     assert {path.name for path in folder.iterdir()} == names | {"record.json", ".lock"}
+
+
+def test_a_run_that_is_made_longer_says_so_in_its_record(tmp_path):
+    pipeline.open_record(tmp_path, "input", SETTINGS, "there")
+    (tmp_path / "evolution.json").touch()
+    longer = dataclasses.replace(SETTINGS, generations=8)
+    assert pipeline.open_record(tmp_path, "input", longer, "there")["settings"] == longer.as_dict()
+
+
+def test_the_time_of_a_stage_is_that_of_all_its_starts(tmp_path, in_this_process):
+    def stage(pool):
+        time.sleep(0.05)
+        if not (tmp_path / "record.json").exists():
+            raise KeyboardInterrupt
+        return True
+
+    asked = {"mdn_rnn": stage}, ["mdn_rnn"], {"settings": SETTINGS.as_dict(), "seconds": {}}, tmp_path, None
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run_stages(*asked, in_this_process)
+    assert load_json(tmp_path / "record.json")["seconds"]["mdn_rnn"] >= 0.05
+    pipeline.run_stages(*asked, in_this_process)
+    record = load_json(tmp_path / "record.json")
+    assert record["seconds"]["mdn_rnn"] >= 0.1 and len(record["peak_memory"]["mdn_rnn"]) == 2

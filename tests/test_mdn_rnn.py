@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from stad_lab import mdn_rnn as room
 from stad_lab.checkpoints import load_json, load_tensors, save_json
 from stad_lab.mdn_rnn import (
     MDNRNN,
@@ -303,3 +304,22 @@ def test_weights_for_another_variant_are_refused(tmp_path):
 def test_weights_of_another_part_are_refused(quick_run):
     with pytest.raises(ValueError, match="holds 'autoencoder': expected 'mdn_rnn'"):
         load_mdn_rnn(quick_run / "autoencoder.safetensors")
+
+
+def test_every_step_of_m_sees_other_sequences(tmp_path, monkeypatch):
+    drawn, own = [], room.sequence_batch
+    monkeypatch.setattr(room, "sequence_batch", lambda *given: drawn.append(own(*given)) or drawn[-1])
+    fit_made_up(tmp_path / "m.safetensors")
+    batches = [z for z, _ in drawn if len(z) == Settings.preset("quick").m_batch]  # the held-out ones are larger
+    assert len(batches) == len({z.numpy().tobytes() for z in batches}) == 60
+
+
+def test_a_training_state_of_m_names_its_v_and_its_rollouts(tmp_path, monkeypatch):
+    told, episode = [], np.repeat([0, 1], 30)
+    monkeypatch.setattr(room, "fit", lambda *given: told.append(given[-1]) or [])
+    parts = np.flatnonzero(episode == 0), np.flatnonzero(episode == 1)
+    for v, seen in (("v", "one"), ("another", "one"), ("v", "other")):
+        rollouts = SimpleNamespace(episode=episode, identity=seen, split=lambda: parts)
+        settings = Settings.preset("quick", m_steps=0)
+        fit_mdn_rnn(tmp_path / "m.safetensors", make_mdn_rnn(), "input", v, [], [], rollouts, settings)
+    assert told[0] not in told[1:]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 
 from stad_lab import load_agent
 from stad_lab.drives import driven_path, record_drive, remember_drive
@@ -120,3 +121,23 @@ def test_dead_reckoning_follows_the_car(session):
     moved = np.array(hull.position) - start
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     assert np.linalg.norm(driven_path(session.drive().motion)[-1] - turn @ moved) < 0.1 * np.linalg.norm(moved)
+
+
+def test_a_dream_begins_with_m_s_memory_from_before_the_frame_in_sight(session):
+    session.give("agent")
+    drive(session, ("", 12))
+    session.enter("dream")
+    assert session.hidden.any() and np.array_equal(session.hidden, session.agent.hidden[0])
+    session.step()
+    done, seen = (torch.from_numpy(part)[None] for part in (session.dreamt().actions, session.agent.latents))
+    with torch.no_grad():
+        after, _ = session.agent.mdn_rnn.remember(seen, done, session.before)
+    assert np.allclose(session.hidden, after[0, 0], atol=1e-5)
+
+
+def test_a_second_episode_is_driven_as_if_it_were_the_first(session):
+    session.give("agent")
+    drive(session, ("", 10))
+    session.begin(4)
+    drive(session, ("", 10))
+    assert np.array_equal(session.drive().actions, record_drive(load_agent("input"), track=4, frames=10).actions)

@@ -1,5 +1,7 @@
 """The probe finds a planted linear signal, finds nothing in noise, and never splits a drive."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -76,3 +78,10 @@ def test_the_same_seed_gives_the_same_numbers():
 def test_rows_that_cannot_be_probed_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         probe(*change(*planted()))
+
+
+def test_an_interval_holds_the_middle_95_percent_of_the_resamples(monkeypatch):
+    count = itertools.count()
+    monkeypatch.setattr("stad_lab.probe.r2_of_sums", lambda sums: np.full(2, float(next(count))))
+    found = probe(*planted(), resamples=1001)
+    assert found["low"] == pytest.approx([25, 25]) and found["high"] == pytest.approx([975, 975])

@@ -6,14 +6,25 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+import torch
 
-from stad_lab.agent import load_controller, read_world_model
-from stad_lab.checkpoints import load_json
+from stad_lab.agent import WorldModel, load_controller, read_world_model
+from stad_lab.autoencoder import AutoEncoder
+from stad_lab.checkpoints import load_json, save_tensors
 from stad_lab.controller import control, seen_columns
 from stad_lab.evolution import averaged_mean, evolve, replay
+from stad_lab.mdn_rnn import MDNRNN
 from stad_lab.pipeline import ship, train
 from stad_lab.rollouts import Rollouts, collect_rollouts
-from stad_lab.search_space import features, find_components, principal_components, search_space
+from stad_lab.search_space import (
+    COMPONENTS,
+    START,
+    features,
+    find_components,
+    principal_components,
+    save_start,
+    search_space,
+)
 from stad_lab.settings import Settings
 from stad_lab.verify import verify
 
@@ -130,3 +141,15 @@ def test_a_run_along_components_is_verified_shipped_and_verified_again(searched,
         found = verify(folder)
         assert found["log of CMA-ES"] == "ok: 4 generations lead to the same mean", found
         assert not any(outcome.startswith("FAILED") for outcome in found.values()), found
+
+
+def test_a_search_along_components_begins_at_the_start_too(tmp_path):
+    identities = {"autoencoder": "v", "mdn_rnn": "m"}
+    world_model = WorldModel(AutoEncoder("input", 4, 4), MDNRNN(4, 8, 3), 4, True, identities)
+    start = np.arange(39.0)
+    save_start(tmp_path / START, start, "input", world_model)
+    parts = {"middle": torch.ones(12).double(), "components": torch.eye(12).double()[:5]}
+    save_tensors(tmp_path / COMPONENTS, parts, part="components", variant="input", **identities)
+    for components in (5, 0):
+        space = search_space(Settings.preset("quick", components=components), world_model, tmp_path)
+        assert np.array_equal(space.expand(space.first), start)

@@ -1,6 +1,7 @@
 """A second round: both drivers' episodes, C carried over to another V and M, and one budget for all of it."""
 
 import dataclasses
+import itertools
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -231,3 +232,41 @@ def test_a_second_round_needs_both_an_earlier_run_and_episodes(episodes, earlier
     with pytest.raises(ValueError, match=f"agent_episodes={episodes} and earlier={earlier}: a second round needs both"):
         train(VARIANT, Settings.preset("quick", agent_episodes=episodes), tmp_path / "run", earlier=earlier)
     assert not (tmp_path / "run").exists()
+
+
+def test_an_unsteady_hand_is_given_up_when_it_reaches_no_new_tile_and_not_before(agent):
+    settings = Settings.preset("quick", agent_episodes=3)
+    both = [dataclasses.replace(settings, patience=patience) for patience in (13, 0)]
+    given_up, (_, actions, track) = (drive_noisily(agent, chosen, 0) for chosen in both)
+    env = make_env()
+    env.reset(seed=track)
+    reached = [t for t, action in enumerate(actions, 1) if env.step(action)[1] > 0]
+    env.close()
+    last = next(t for t, following in itertools.pairwise([0, *reached, 1000]) if following - t > 13)
+    assert len(given_up[0]) == min(60, last + 13) > 13
+
+
+def test_random_episodes_count_once_only_if_they_are_those_of_the_first_round():
+    driven, settings = {"episodes": 8, "frames": 480}, Settings.preset("quick").as_dict()
+    first = {"settings": settings, "budget": {"random": driven, "agents": 16}}
+    for seed, episodes in ((0, 8), (1, 16)):
+        record = {"settings": settings | {"seed": seed}, "budget": {"random": driven}, "earlier": first}
+        assert total_budget(record) == {"episodes": episodes, "frames": 60 * episodes, "agents": 16}
+
+
+def test_the_drives_of_another_agent_are_another_dataset(quick_run, tmp_path, monkeypatch):
+    made, settings = [], Settings.preset("quick", agent_episodes=3)
+    monkeypatch.setattr("stad_lab.second_round.collect", lambda folder, made_with, *rest: made.append(made_with))
+    other = shutil.copytree(quick_run, tmp_path / "other", ignore=shutil.ignore_patterns("rollouts"))
+    parameters, _ = load_controller(other / "controller.safetensors", "input_output")
+    save_controller(other / "controller.safetensors", parameters + 1, variant="input_output")
+    for earlier in (quick_run, quick_run, other):
+        collect_again("input_output", settings, earlier, tmp_path, object())
+    assert made[0] == made[1] != made[2]
+
+
+def test_the_penalty_of_the_regression_is_for_each_frame():
+    rng, columns = np.random.default_rng(0), np.ones(20, bool)
+    seen, wanted = rng.standard_normal((100, 20)), rng.standard_normal((100, 3))
+    once, often = (fit_controller(np.tile(seen, (n, 1)), np.tile(wanted, (n, 1)), columns) for n in (1, 50))
+    assert often == pytest.approx(once, rel=1e-6)

@@ -23,6 +23,7 @@ from stad_lab.study import (
     lesser_forecasts,
     probe_drives,
     probe_panels,
+    probe_part,
     simple_forecasts,
     study,
 )
@@ -171,3 +172,25 @@ def test_the_shipped_record_is_a_whole_study_of_what_is_shipped():
     assert all(list(found) == [str(stride) for stride in STRIDES] for found in record["probe"]["strides"].values())
     assert list(record["autoencoder"]["rate_distortion"]) == [f"{weight:g}" for weight in KL_WEIGHTS]
     assert set(record["autoencoder"]["variants"]) == set(record["mdn_rnn"]["variants"]) == set(VARIANTS)
+
+
+def test_every_v_is_probed_with_its_own_stride(monkeypatch, tmp_path):
+    asked, room = [], "stad_lab.study."
+    monkeypatch.setattr(room + "shorter_autoencoder", lambda *given, stride: f"V of stride {stride}")
+    monkeypatch.setattr(room + "two_drivers", lambda *given: {"random driver": ([], 8)})
+    monkeypatch.setattr(room + "probe_variants", lambda *given: {})
+    monkeypatch.setattr(room + "probe_drives", lambda *given: asked.append((given[2], given[4])))
+    probe_part(Settings.preset("quick"), tmp_path, tmp_path, [])
+    assert asked == [(f"V of stride {stride}", stride) for stride in STRIDES]
+
+
+def test_frames_without_a_road_in_sight_do_not_count_in_a_probe():
+    settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
+    drives = [record_random_drive(settings, index) for index in range(12)]
+    asked = (8, AutoEncoder("input_output", width=4), {}, settings.stride, settings.crop_bar)
+    for drive in drives:
+        drive.motion[20:25, list(MOTION).index("road offset")] = 9.0
+    found = probe_drives(drives, *asked)
+    for drive in drives:
+        drive.motion[20:25, list(MOTION).index("yaw rate")] = 1e3
+    assert probe_drives(drives, *asked) == found
