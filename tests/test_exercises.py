@@ -234,9 +234,17 @@ WRONG = [
         "01",
         "interval-check",
         "def correlation_interval(x, y, units, rng, resamples):\n"
-        "    drawn = [np.isin(units, rng.choice(12, 12)) for _ in range(resamples)]\n"
+        "    drawn = [np.isin(units, rng.choice(np.unique(units), 12)) for _ in range(resamples)]\n"
         "    return np.percentile([np.corrcoef(x[d], y[d])[0, 1] for d in drawn], [2.5, 97.5])",
         "counts it once",
+    ),
+    (
+        "01",
+        "interval-check",
+        "def correlation_interval(x, y, units, rng, resamples):\n"
+        "    own = np.array([np.corrcoef(x[units == u], y[units == u])[0, 1] for u in np.unique(units)])\n"
+        "    return np.percentile([rng.choice(own, len(own)).mean() for _ in range(resamples)], [2.5, 97.5])",
+        "mean of every unit's own correlation",
     ),
     ("02", "kl-values", "kl = lambda mu, logvar: (mu**2 + logvar.exp() - 1 - logvar).sum(1)", "1/2 is missing"),
     (
@@ -408,6 +416,22 @@ WRONG = [
         "    drawn = rng.integers(15, size=(2000, 15))\n"
         "    return np.percentile([horizon(dream[rows], constant[rows]) for rows in drawn], [5, 95])",
         "90% interval",
+    ),
+    (
+        "03",
+        "horizon-interval-check",
+        "def horizon_interval(dream, constant, rng):\n"
+        "    drawn = rng.integers(15, size=(2000, 15))\n"
+        "    return np.percentile([horizon(dream[rows], constant) for rows in drawn], [2.5, 97.5])",
+        "draw them along",
+    ),
+    (
+        "03",
+        "horizon-interval-check",
+        "def horizon_interval(dream, constant, rng):\n"
+        "    drawn = rng.integers(15, size=(2000, 2, 15))\n"
+        "    return np.percentile([horizon(dream[one], constant[other]) for one, other in drawn], [2.5, 97.5])",
+        "draw the drives once, for both",
     ),
     ("04", "weights-check", "weights = lambda n: np.log(n // 2 + 0.5) - np.log(np.arange(1, n // 2 + 1))", "sum to 1"),
     (
