@@ -469,6 +469,26 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     assert round(float(np.delete(last[-5:], 3).mean() - mean["frame", 0])) == 57  # nobody chose these
 
 
+def test_the_words_on_another_v_of_frame_hold_for_the_records():
+    rows = kept_rows()
+    (own,), first = rows["paper_frame_400"], rows["paper_frame"]
+    log = load_json(own / LOG)
+    assert len(log["generations"]) == 400 and log["autoencoder"] not in {v for v, _ in worlds(first)}
+    score, before = (float(official_returns(folders).mean()) for folders in ([own], first))
+    gain = f"{round(score) - round(before)}"
+    assert f"the search has {score:.0f}, {gain} points more than the mean" in README
+    assert f"has {score:.0f} ({(official_returns([own]) >= 900).sum()} complete laps of 100), {gain} points" in RESULTS
+    assert f"{score:.0f} on the official tracks" in NOTEBOOK and f"of `frame` was worth {gain} points" in NOTEBOOK
+    others = [("input", 0), ("output", 0), ("output", 1), ("input_output", 0)]  # places among a row's kept seeds
+    found = [rows[f"paper_{variant}"][place] for variant, place in others]
+    five = [f"{learning_curve(folder)[1][15:20].mean():.0f}" for folder in (own, *first, *found)]
+    told = f"it has {five[0]}, the two on the first V {five[1]} and {five[2]}, the four {', '.join(five[3:])}"
+    assert told in RESULTS and told in NOTEBOOK
+    average = fitness_curves(log["generations"])[1]
+    hundreds = [f"{average[start : start + 100].mean():.0f}" for start in range(0, 400, 100)]
+    assert f"have {', '.join(hundreds[:3])} and {hundreds[3]} points on average" in NOTEBOOK
+
+
 def test_the_words_on_the_rows_without_the_bar_hold_for_the_records():
     rows = kept_rows()
     blind, shown, base = (official_returns(rows[name]) for name in ("no_bar_frame", "no_bar", "one_round"))
