@@ -487,6 +487,10 @@ def test_the_words_on_another_v_of_frame_hold_for_the_records():
     average = fitness_curves(log["generations"])[1]
     hundreds = [f"{average[start : start + 100].mean():.0f}" for start in range(0, 400, 100)]
     assert f"have {', '.join(hundreds[:3])} and {hundreds[3]} points on average" in NOTEBOOK
+    four = [fitness_curves(load_json(folder / LOG)["generations"])[1] for folder in found]
+    spans = [sorted(f"{curve[start : start + 100].mean():.0f}" for curve in four) for start in (0, 100)]
+    told = f"have {hundreds[0]} and {hundreds[1]} points in those two hundreds, on other tracks, those of the four"
+    assert f"{told} {spans[0][0]} to {spans[0][-1]} and {spans[1][0]} to {spans[1][-1]}" in RESULTS
 
 
 def test_the_words_on_the_rows_without_the_bar_hold_for_the_records():
