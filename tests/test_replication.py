@@ -389,11 +389,11 @@ def test_every_row_that_we_report_holds_its_protocol():
                     assert spent["agents"] <= 4800 and (spent["episodes"] <= 4800 or more)
 
 
-def test_a_row_is_driven_on_the_hundred_official_tracks_with_gymnasium_s_renderer(tmp_path, monkeypatch):
+def test_a_row_is_driven_on_the_official_tracks_with_gymnasium_s_renderer(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(replication, "evaluate", lambda *given, **named: asked.append((given, named)) or {})
     (tmp_path / "controller.safetensors").write_bytes(b"C")
     replication.evaluate_row(ROWS["paper_input"], tmp_path, None)
     call = inspect.signature(evaluate).bind(*asked[0][0], **asked[0][1])
     call.apply_defaults()
-    assert [call.arguments[name] for name in ("episodes", "first_track", "fast")] == [100, 0, False]
+    assert [call.arguments[name] for name in ("episodes", "first_track", "fast")] == [replication.TRACKS, 0, False]
