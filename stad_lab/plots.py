@@ -237,7 +237,7 @@ def plot_claims(scores: dict[str, dict[str, tuple[float, list[float], list[float
 
     A dot is a mean, with its interval; a short line through it is one search. The second panel is a close-up.
     """
-    names = list(next(iter(scores.values())))
+    names = list(dict.fromkeys(name for found in scores.values() for name in found))  # a variant may lack some
     figure, ((whole, close),) = new_figure(9.0, 3.4, 1, 2, sharey=True, gridspec_kw={"width_ratios": [3, 2]})
     for axis, (place, found) in itertools.product((whole, close), enumerate(scores.values())):
         for name, color, shift in zip(names, COLORS, np.linspace(-0.27, 0.27, len(names)), strict=False):

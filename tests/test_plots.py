@@ -8,6 +8,7 @@ from stad_lab.car_racing import TRACK_WIDTH
 from stad_lab.plots import (
     STYLES,
     plot_bars,
+    plot_claims,
     plot_curves,
     plot_intervals,
     plot_mixture,
@@ -15,6 +16,13 @@ from stad_lab.plots import (
     plot_shares,
     plot_stacks,
 )
+
+
+def test_what_the_first_variant_lacks_is_drawn_for_the_others():
+    paper, ours = (827.0, [827.0, 827.0], []), (637.0, [600.0, 670.0], [637.0])
+    figure = plot_claims({"frame": {"the paper": paper}, "input": {"the paper": paper, "ours": ours}})
+    assert [text.get_text() for text in figure.legends[0].texts] == ["the paper", "ours"]
+    assert any(637.0 in line.get_xdata() for line in figure.axes[0].lines)
 
 
 def test_the_alternative_text_of_a_figure_tells_its_values():
