@@ -19,7 +19,6 @@ from pathlib import Path
 GREEN, AMBER, RED = "green", "amber", "red"
 COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
-NO_GPU = "none is needed; see whether another process has taken it"
 LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = (
     *("numpy", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma", "sklearn", "scipy", "safetensors"),
@@ -266,22 +265,21 @@ def check_gpu() -> Iterator[Line]:
     if not torch.cuda.is_available():
         yield Line(GREEN, "GPU", "none, and none is needed")
         return
-    unusable = "cannot be used now, so V and M train on the CPU"
+    name = "there is one that"  # until it tells its name
     try:
         name, (major, minor) = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
-    except (RuntimeError, AssertionError) as error:
-        yield Line(AMBER, "GPU", f"{unusable}: {error}", NO_GPU)
-        return
-    built = [int(kind[3:].rstrip("af")) for kind in torch.cuda.get_arch_list() if kind.startswith("sm_")]  # NVIDIA's
-    if built and 10 * major + minor < min(built):
-        remedy = "none is needed; for this one install a PyTorch that is built for an older CUDA, see pytorch.org"
-        yield Line(AMBER, "GPU", f"{name} is too old for this PyTorch: V and M train on the CPU", remedy)
-        return
-    try:  # as `training.training_device` does
-        torch.ones(1, device="cuda").add_(1).item()
+        built = [
+            int(kind[3:].rstrip("af")) for kind in torch.cuda.get_arch_list() if kind.startswith("sm_")
+        ]  # NVIDIA's
+        if built and 10 * major + minor < min(built):
+            remedy = "none is needed; for this one install a PyTorch that is built for an older CUDA, see pytorch.org"
+            yield Line(AMBER, "GPU", f"{name} is too old for this PyTorch: V and M train on the CPU", remedy)
+            return
+        torch.ones(1, device="cuda").add_(1).item()  # as `training.training_device` does
         yield Line(GREEN, "GPU", name)
     except (RuntimeError, AssertionError) as error:
-        yield Line(AMBER, "GPU", f"{name} {unusable}: {error}", NO_GPU)
+        remedy = "none is needed; see whether another process has taken it"
+        yield Line(AMBER, "GPU", f"{name} cannot be used now, so V and M train on the CPU: {error}", remedy)
 
 
 def check_widgets() -> Iterator[Line]:
