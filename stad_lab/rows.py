@@ -78,8 +78,9 @@ def make_rows() -> dict[str, Row]:
     for name, (about, changes, shares) in ABLATIONS.items():
         settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
         rows[name] = Row("input", about, settings, seeds=(0,), world=world)
-    about = f"{rows['no_bar'].about}, and no difference images"
-    rows["no_bar_frame"] = dataclasses.replace(rows["no_bar"], variant="frame", about=about)
+    for variant, what in (("frame", "no difference images"), ("input_output", "the difference image redrawn, too")):
+        about = f"{rows['no_bar'].about}, and {what}"
+        rows[f"no_bar_{variant}"] = dataclasses.replace(rows["no_bar"], variant=variant, about=about)
     return rows
 
 
