@@ -50,9 +50,6 @@ def make_rows() -> dict[str, Row]:
     rows = {}
     for variant in VARIANTS:
         rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
-    # Another V of `frame`, on a slower machine: two thirds of the generations fitted into its time.
-    shorter = Settings.preset("paper", generations=400)
-    rows["paper_frame_400"] = Row("frame", "the paper's recipe, 400 of its 600 generations", shorter, seeds=(2,))
     # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
     one = Settings.preset("laptop", crop_bar=False)
     # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
