@@ -513,27 +513,42 @@ def test_the_words_on_the_second_v_of_frame_hold_for_the_records():
 
 def test_the_words_on_the_rows_without_the_bar_hold_for_the_records():
     rows = kept_rows()
-    names = "no_bar_frame", "no_bar", "no_bar_input_output", "one_round"
-    blind, shown, redrawn, base = (official_returns(rows[name]) for name in names)
-    told = f"have {shown.mean():.1f} (`input`), {blind.mean():.1f} (`frame`) and {redrawn.mean():.1f} (`input_output`)"
-    assert told in RESULTS
-    gap, lead = blind.mean() - shown.mean(), redrawn.mean() - blind.mean()
-    low, high = bootstrap_gain(blind, shown)
-    behind = f"`input` is {gap:.1f} points behind `frame` ({-low:.1f} behind to {high:.1f} ahead, for the luck in the"
-    low, high = bootstrap_gain(blind, redrawn)
-    assert f"{behind} tracks alone), and `input_output` {lead:.1f} ahead ({low:.1f} to {high:.1f})" in RESULTS
-    assert f"a lead of {lead:.0f} points, in the paper's direction ({low:.0f} to {high:.0f}, for the luck" in RESULTS
-    laps = [int((found >= 900).sum()) for found in (redrawn, blind, shown)]
-    assert [int((found < 800).sum()) for found in (redrawn, blind, shown)] == [4, 18, 18]
-    told = "has {:.0f}, with {} complete laps of 100 and 4 drives below 800; `frame` has {:.0f} ({} and 18), `input`"
-    assert told.format(redrawn.mean(), laps[0], blind.mean(), laps[1]) in RESULTS
-    assert f"`input` {shown.mean():.0f} ({laps[2]} and 18)" in RESULTS
-    told = "has {:.0f}, fails four times, and completes {} laps of 100 where the others complete {} and {}"
-    assert told.format(redrawn.mean(), *laps) in NOTEBOOK
+    names = {
+        "frame": "no_bar_frame",
+        "input": "no_bar",
+        "output": "no_bar_output",
+        "input_output": "no_bar_input_output",
+    }
+    returns = {variant: official_returns(rows[name]) for variant, name in names.items()}
+    blind, base = returns["frame"], official_returns(rows["one_round"])
+    mean = {variant: float(found.mean()) for variant, found in returns.items()}
+    told = "have {input:.1f} (`input`), {frame:.1f} (`frame`), {output:.1f} (`output`) and {input_output:.1f} (`input_o"
+    assert told.format(**mean) in RESULTS
+    lead = {variant: score - mean["frame"] for variant, score in mean.items()}
+    low, high = (np.array([bootstrap_gain(blind, returns[v])[side] for v in names]) for side in (0, 1))
+    behind = "`{}` is {:.1f} points behind `frame` ({:.1f} behind to {:.1f} ahead, for the luck in the tracks alone)"
+    told = behind.format("input", -lead["input"], -low[1], high[1])
+    told += (
+        f", `output` {-lead['output']:.1f} behind ({-low[2]:.1f} behind to {high[2]:.1f} ahead), and `input_output` "
+    )
+    assert f"{told}{lead['input_output']:.1f} ahead ({low[3]:.1f} to {high[3]:.1f})" in RESULTS
+    told = f"a lead of {lead['input_output']:.0f} points over `frame`, in the paper's direction"
+    assert f"{told} ({low[3]:.0f} to {high[3]:.0f}, for the luck" in RESULTS
+    laps = {variant: int((found >= 900).sum()) for variant, found in returns.items()}
+    failed = {variant: int((found < 800).sum()) for variant, found in returns.items()}
+    assert failed == {"frame": 18, "input": 18, "output": 17, "input_output": 4}
+    told = f"has {mean['input_output']:.0f}, with {laps['input_output']} complete laps of 100 and 4 drives below 800"
+    others = [f"{mean[v]:.0f} ({laps[v]} and {failed[v]})" for v in ("frame", "output", "input")]
+    assert told + "; `frame` has {}, `output` {}, `input` {}.".format(*others) in RESULTS
+    told = f"completes {laps['input_output']} laps of 100 where the others complete {laps['frame']} to {laps['output']}"
+    assert told in NOTEBOOK and "810 and 838, and `input_output`, whose z does, 894" in README
+    others = [mean[variant] for variant in ("frame", "input", "output")]
+    assert [round(score) for score in (min(others), mean["output"], max(others))] == [810, 838, 845]
+    assert round(1 / float(ttest_ind(others, [mean["input_output"]]).pvalue)) == 10  # in one case of so many
     assert round(max(float(official_returns(folders).max()) for folders in rows.values())) == 944
-    assert (round(float(blind.mean())), round(float(shown.mean()))) == (845, 810)  # README, notebook 05
     scatter = base.mean(axis=1).std(ddof=1) * np.sqrt(2)
-    assert [round(1 / (2 * t.sf(apart / scatter, 2))) for apart in (gap, lead)] == [2, 3]  # in one case of so many
+    apart = [abs(lead[variant]) / scatter for variant in ("input", "input_output")]
+    assert [round(1 / (2 * t.sf(far, 2))) for far in apart] == [2, 3]  # in one case of so many
 
 
 def test_the_words_on_luck_in_the_searches_hold_for_the_records():
