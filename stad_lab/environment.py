@@ -268,9 +268,8 @@ def check_gpu() -> Iterator[Line]:
     name = "there is one that"  # until it tells its name
     try:
         name, (major, minor) = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
-        built = [
-            int(kind[3:].rstrip("af")) for kind in torch.cuda.get_arch_list() if kind.startswith("sm_")
-        ]  # NVIDIA's
+        nvidia = [kind for kind in torch.cuda.get_arch_list() if kind.startswith("sm_")]
+        built = [int(kind[3:].rstrip("af")) for kind in nvidia]
         if built and 10 * major + minor < min(built):
             remedy = "none is needed; for this one install a PyTorch that is built for an older CUDA, see pytorch.org"
             yield Line(AMBER, "GPU", f"{name} is too old for this PyTorch: V and M train on the CPU", remedy)

@@ -513,19 +513,14 @@ def test_the_words_on_the_second_v_of_frame_hold_for_the_records():
 
 def test_the_words_on_the_rows_without_the_bar_hold_for_the_records():
     rows = kept_rows()
-    names = {
-        "frame": "no_bar_frame",
-        "input": "no_bar",
-        "output": "no_bar_output",
-        "input_output": "no_bar_input_output",
-    }
-    returns = {variant: official_returns(rows[name]) for variant, name in names.items()}
+    returns = {ROWS[name].variant: official_returns(rows[name]) for name in rows if name.startswith("no_bar")}
+    assert set(returns) == set(VARIANTS)
     blind, base = returns["frame"], official_returns(rows["one_round"])
     mean = {variant: float(found.mean()) for variant, found in returns.items()}
     told = "have {input:.1f} (`input`), {frame:.1f} (`frame`), {output:.1f} (`output`) and {input_output:.1f} (`input_o"
     assert told.format(**mean) in RESULTS
     lead = {variant: score - mean["frame"] for variant, score in mean.items()}
-    low, high = (np.array([bootstrap_gain(blind, returns[v])[side] for v in names]) for side in (0, 1))
+    low, high = zip(*(bootstrap_gain(blind, returns[variant]) for variant in VARIANTS), strict=True)
     behind = "`{}` is {:.1f} points behind `frame` ({:.1f} behind to {:.1f} ahead, for the luck in the tracks alone)"
     told = behind.format("input", -lead["input"], -low[1], high[1])
     told += (
