@@ -1,6 +1,6 @@
 """The command line, `python -m stad_lab`.
 
-Commands: check, train, finish, evaluate, verify, replicate, table, study, benchmark, ship, film.
+Commands: check, train, finish, evaluate, verify, replicate, table, probe, study, benchmark, ship, film.
 """
 
 import argparse
@@ -19,7 +19,7 @@ if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports t
     print(report := check_environment())
     sys.exit(0 if report.ok else 1)
 
-from stad_lab.agent import load_agent, run_folder
+from stad_lab.agent import load_agent, load_world_model, run_folder
 from stad_lab.autoencoder import VARIANTS, check_variant
 from stad_lab.benchmark import PARTS, benchmark
 from stad_lab.checkpoints import check_writable, save_json, write_bytes
@@ -31,7 +31,7 @@ from stad_lab.replication import describe_forecast, describe_row, forecast, keep
 from stad_lab.rows import FLOORS, ROWS
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
-from stad_lab.study import study
+from stad_lab.study import PROBE_DRIVES, describe_probe, probe_run, study
 from stad_lab.table import RECORDS, claims_and_outcomes, describe_table, kept_rows
 from stad_lab.verify import verify
 
@@ -51,6 +51,7 @@ def build_parser() -> argparse.ArgumentParser:
         add_verify,
         add_replicate,
         add_table,
+        add_probe,
         add_study,
         add_benchmark,
         add_ship,
@@ -350,6 +351,37 @@ def do_table(options: argparse.Namespace) -> None:
         figure = plot_claims(claims_and_outcomes(rows))
         write_bytes(options.picture, to_png(figure))
         print(f"drawn to {options.picture}: {figure.get_label()}")
+
+
+def add_probe(commands: argparse._SubParsersAction) -> None:
+    """The command probe."""
+    command = commands.add_parser(
+        "probe",
+        help="measure what the latents of a run know of the car's motion",
+        description="Fit a linear probe from z, and from z with M's memory h, to the true motion of the car, and print"
+        " its R2 on unseen drives of two drivers, a random one and the `input` agent that comes with stad_lab. Wants V"
+        " and M alone, so it can be asked while C is still searched; takes a few minutes.",
+    )
+    add_variant(command)
+    add_path(command)
+    command.add_argument("--drives", type=int, default=PROBE_DRIVES, help=f"random drives, default {PROBE_DRIVES}")
+    command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
+    command.add_argument(
+        "--json", type=Path, help="where to write the result; default probe-VARIANT.json in the run, or here"
+    )
+    command.set_defaults(do=do_probe)
+
+
+def do_probe(options: argparse.Namespace) -> None:
+    """Probe V and M, and write every R2 with its interval."""
+    file = options.json or (options.path or Path()) / f"probe-{options.variant}.json"
+    check_variant(options.variant)
+    load_world_model(run_folder(options.variant, options.path), options.variant)
+    check_writable(file)
+    found = probe_run(options.variant, options.path, options.drives, options.processes)
+    print(describe_probe(found), flush=True)
+    save_json(file, found)
+    print(f"  with intervals: {file}")
 
 
 def add_study(commands: argparse._SubParsersAction) -> None:

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model
-from stad_lab.autoencoder import VARIANTS, AutoEncoder, check_facts, kl_divergence, load_autoencoder
+from stad_lab.agent import PRETRAINED, WorldModel, load_agent, load_world_model, run_folder
+from stad_lab.autoencoder import VARIANTS, AutoEncoder, check_facts, check_variant, kl_divergence, load_autoencoder
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.drives import (
     MOTION,
@@ -66,6 +66,8 @@ CONTENDERS = {  # lesser M's: what is changed, and whether they see the actions
 DRIVE_FRAMES, AGENT_FRAMES = 150, 360  # of a drive of the random driver, and of the agent
 # Frames of a drive that are not probed: without a difference image, or with the opening zoom, which tells the speed.
 RANDOM_SKIP, AGENT_SKIP = max(STRIDES), 60
+FEWEST_DRIVES = 12  # a probe is fitted on some and measured on others
+PROBE_DRIVES, PROBE_SEED = 180, 100  # of the random driver, when a run is probed; no rollouts of ours have this seed
 STUDY_COMMAND = "python -m stad_lab study --settings {} --part {} --out ..."
 RECORD = Path(__file__).parent / "records" / "study.json"  # the study that we report
 AWAKE = 30  # frames that M sees before a dream
@@ -88,7 +90,7 @@ def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str
     """
     check_parts(parts)
     collect_rollouts(settings, rollouts_folder)
-    drives = random_drives(max(12, settings.episodes // 5), settings.seed + 1, settings.processes)
+    drives = random_drives(max(FEWEST_DRIVES, settings.episodes // 5), settings.seed + 1, settings.processes)
     file, result = Path(work) / "study.json", {}
     for name in parts:
         found = PARTS[name](settings, Path(rollouts_folder), Path(work), drives)
@@ -133,7 +135,7 @@ def begin_agent_drive(track: int) -> Drive:
 def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
     """Probe the latents of every variant, and of every stride, for the true motion, under two drivers."""
     strides = {str(stride): shorter_autoencoder(settings, rollouts_folder, work, stride=stride) for stride in STRIDES}
-    drivers = two_drivers(settings, drives)
+    drivers = two_drivers(drives, settings.processes)
     result = {"variants": probe_variants(settings, PRETRAINED, drivers), "strides": {}}
     for driver, (driven, skip) in drivers.items():
         found = result["strides"][driver] = {}
@@ -145,12 +147,12 @@ def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: li
 def bar_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
     """Probe the latents of the second rounds' V and M as `probe_part` does: do they hold the gauges of the bar?"""
     with_bar = dataclasses.replace(settings, crop_bar=False)
-    return {"variants": probe_variants(with_bar, PRETRAINED / "second_round", two_drivers(settings, drives))}
+    return {"variants": probe_variants(with_bar, PRETRAINED / "second_round", two_drivers(drives, settings.processes))}
 
 
-def two_drivers(settings: Settings, drives: list[Drive]) -> dict[str, tuple[list[Drive], int]]:
+def two_drivers(drives: list[Drive], processes: int) -> dict[str, tuple[list[Drive], int]]:
     """The two drivers under which latents are probed: name -> their drives, and how many first frames do not count."""
-    by_agent = agent_drives(max(12, len(drives) // 3), settings.processes)
+    by_agent = agent_drives(max(FEWEST_DRIVES, len(drives) // 3), processes)
     return {"random driver": (drives, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
 
 
@@ -203,6 +205,51 @@ def probe_drives(
             for quantity, r2, low, high in zip(MOTION, *found.values(), strict=True)
         }
     return result
+
+
+def probe_run(variant: str, path: str | Path | None = None, drives: int = PROBE_DRIVES, processes: int = 2) -> dict:
+    """Probe V and M of one run for the true motion, under the study's two drivers: what do *these* latents know?
+
+    Args:
+        variant: of the run.
+        path: its folder, with V and M at least; None for those that come with stad_lab, as `load_agent` chooses them.
+        drives: of the random driver; those of the agent are a third as many, but 12 at least.
+        processes: that drive.
+
+    Returns:
+        A dict for JSON: "variant", "autoencoder" and "mdn_rnn" (the identities of V and M), "drives", "drivers" (name
+        of the driver -> what `probe_drives` finds of "z" and of "z, h") and "made_with".
+
+    Raises:
+        ValueError: an unknown variant, too few drives, or V and M that are damaged or do not belong together.
+        FileNotFoundError: no V or M there.
+    """
+    check_variant(variant)
+    if drives < FEWEST_DRIVES:
+        raise ValueError(f"drives is {drives}: expected at least {FEWEST_DRIVES}, so that the probe has unseen ones")
+    autoencoder, mdn_rnn, stride, crop_bar, identities = load_world_model(run_folder(variant, path), variant)
+    drivers = two_drivers(random_drives(drives, PROBE_SEED, processes), processes)
+    return {
+        "variant": variant,
+        **identities,
+        "drives": drives,
+        "drivers": {
+            name: probe_drives(driven, skip, autoencoder, {"z, h": mdn_rnn}, stride, crop_bar)
+            for name, (driven, skip) in drivers.items()
+        },
+        "made_with": provenance(f"python -m stad_lab probe --variant {variant} --path ..."),
+    }
+
+
+def describe_probe(found: dict) -> str:
+    """What `probe_run` found, in lines: the R2 of every quantity, for each driver and for z and z with h."""
+    lines = [f"R2 of a linear probe: V and M of {found['variant']}"]
+    for driver, by_features in found["drivers"].items():
+        lines.append(f"  {driver:18s}" + "".join(f"{quantity:>16s}" for quantity in MOTION))
+        for features, by_quantity in by_features.items():
+            cells = (f"{by_quantity[quantity]['r2'] + 0.0:16.2f}" for quantity in MOTION)
+            lines.append(f"    {features:16s}" + "".join(cells))
+    return "\n".join(lines)
 
 
 def probe_panels(found: dict) -> dict:

@@ -115,6 +115,7 @@ def test_a_budget_that_a_kill_left_behind_is_counted_again_and_a_later_start_by_
         ("ship", ["--variant", "--path"]),
         ("table", ["--records", "--picture"]),
         ("film", ["--variant", "--path", "--out", "--track", "--first", "--frames", "--viewer"]),
+        ("probe", ["--variant", "--path", "--drives", "--processes", "--json"]),
         ("study", ["--settings", "--out", "--rollouts", "--part", "probe", "autoencoder", "mdn_rnn"]),
     ],
 )
@@ -134,6 +135,7 @@ COMMANDS = [
     "verify",
     "replicate",
     "table",
+    "probe",
     "study",
     "benchmark",
     "ship",

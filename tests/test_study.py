@@ -184,6 +184,41 @@ def test_every_v_is_probed_with_its_own_stride(monkeypatch, tmp_path):
     assert asked == [(f"V of stride {stride}", stride) for stride in STRIDES]
 
 
+def test_the_command_probes_v_and_m_of_a_run_and_keeps_every_r2_with_its_interval(quick_run, tmp_path, capsys):
+    file, before = tmp_path / "probe.json", sorted(quick_run.iterdir())
+    arguments = ["--variant", "input_output", "--path", quick_run, "--drives", "12", "--json", file]
+    assert main(["probe", *map(str, arguments)]) == 0
+    found, printed = load_json(file), capsys.readouterr().out
+    assert {"autoencoder": found["autoencoder"], "mdn_rnn": found["mdn_rnn"]} == read_world_model(
+        quick_run, "input_output"
+    ).identities
+    assert list(found["drivers"]) == ["random driver", "trained agent"] and found["drives"] == 12
+    for driver, by_features in found["drivers"].items():
+        assert driver in printed and list(by_features) == ["z", "z, h"]
+        for r2s in by_features.values():
+            assert list(r2s) == list(MOTION)
+            assert all(one["interval"][0] <= one["r2"] <= one["interval"][1] <= 1 for one in r2s.values())
+            assert "".join(f"{one['r2'] + 0.0:16.2f}" for one in r2s.values()) in printed
+    assert sorted(quick_run.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (["--drives", "11"], "drives is 11: expected at least 12"),
+        (["--variant", "both"], "unknown variant 'both'"),
+        (["--path", "nowhere"], "nowhere"),
+    ],
+)
+def test_a_probe_that_cannot_be_made_is_refused_before_any_drive(
+    change, message, quick_run, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("stad_lab.study.random_drives", lambda *given: pytest.fail("a drive began"))
+    assert main(["probe", "--variant", "input_output", "--path", str(quick_run), *change]) == 2
+    assert message in capsys.readouterr().err and not any(tmp_path.iterdir())
+
+
 def test_frames_without_a_road_in_sight_do_not_count_in_a_probe():
     settings = Settings.preset("quick", seed=5, episodes=12, random_starts=1.0)
     drives = [record_random_drive(settings, index) for index in range(12)]
