@@ -512,7 +512,7 @@ def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figu
 
     Args:
         runs: name -> (seeds, 3, generations), for each seed what `evolution.fitness_curves` makes. A line is the mean
-            over the seeds, its band goes from the lowest to the highest.
+            over the seeds, its band goes from the lowest to the highest, and each seed is a thin line in it.
         window: generations of the running mean, which lets a line be seen through the noise; all of a shorter run.
     """
     figure, axes = new_figure(11.0, 3.9, 1, 3, sharey=True)
@@ -522,7 +522,8 @@ def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figu
             smooth = np.apply_along_axis(np.convolve, 1, curves[:, panel], np.full(width, 1 / width), "valid")
             generation = np.arange(smooth.shape[1]) + (width + 1) / 2
             axis.plot(generation, smooth.mean(axis=0), dash, color=color, lw=1.6, label=label)
-            axis.fill_between(generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.2, lw=0)
+            axis.plot(generation, smooth.T, color=color, lw=0.7, alpha=0.5)
+            axis.fill_between(generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.1, lw=0)
         axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
         axis.set_title(f"{name} agent of a generation", fontsize=10)
         axis.set_xlabel("generation")

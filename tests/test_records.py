@@ -418,7 +418,6 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     pairs = {key: round(mean[key] - mean["frame", key[1]]) for key in searches if key not in frames}
     assert [pairs[key] for key in four] == [175, 190, 397, 393]
     assert f"are {pairs['input', 0]} and {pairs[stuck]} for `input`, 190 and 397 for `output`, and 393 for" in RESULTS
-    assert f"`input` is {-pairs[stuck]} behind" in NOTEBOOK
 
     # Another regime, all searches alike, and what the rule can still say.
     short = round(PAPER["frame"] - frame), *(round(PAPER[key[0]] - mean[key]) for key in four)
@@ -448,35 +447,22 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     windows = [[round(float(lead[start : start + 100].mean())) for lead in best.values()] for start in (0, 100)]
     assert [(min(found), max(found)) for found in windows] == [(-75, 205), (161, 404)]
 
-    chosen = [log["best"]["generation"] for log in logs.values()]  # the searches
-    assert "generations {}, {}, {}, {}, {}, {}, {} and {}".format(*chosen) in NOTEBOOK
-    lead = {key: round(mean[key] - frame) for key in (("input", 0), ("output", 1))}
-    told = f"three `paper_frame`, {lead['input', 0]} points, and that of the second `paper_output`, {lead['output', 1]}"
-    assert told in NOTEBOOK
+    assert f"`paper_input` from generation {logs['input', 0]['best']['generation']}." in NOTEBOOK  # the searches
     flattered = {key: round(logs[key]["best"]["validation"] - mean[key]) for key in searches}
     about = [("frame", 0), ("frame", 2), ("input", 0), ("output", 0)]
     assert [flattered[key] for key in about] == [95, 114, 102, 105]
     assert [flattered[key] for key in (("frame", 1), ("output", 1), ("input_output", 1))] == [6, 8, 67]
-    lowest = {count: np.mean([looks[key][-count:].mean() for key in frames]) for count in (5, 15)}
-    over = [[round(float(looks[key][-count:].mean() - low)) for key in four] for count, low in lowest.items()]
-    assert over == [[43, 173, 143, 212], [119, 177, 126, 188]]
     paired = []
     for key in four:
         partner = "frame", key[1]
-        paired.append([round(float((looks[key][-n:] - looks[partner][-n:]).mean())) for n in (5, 15)])
+        paired.append([round(float((looks[key][-5:] - looks[partner][-5:]).mean()))])
         average = curves[key][1] - curves[partner][1]
         paired[-1] += [round(float(average[start : start + 100].mean())) for start in (0, 100)]
-    assert paired == [[25, 127, 151, 304], [156, 184, -35, 190], [386, 360, 167, 376], [455, 422, 134, 229]]
-    shrunk = {key: log["generations"][0]["sigma"] / log["generations"][-1]["sigma"] for key, log in logs.items()}
-    assert [round(shrunk[key]) for key in searches if key != stuck] == [34, 6, 14, 30, 2, 19, 6]
-    assert round(shrunk[stuck]) == 34
+    assert paired == [[25, 151, 304], [156, -35, 190], [386, 167, 376], [455, 134, 229]]
+    assert round(logs[stuck]["generations"][0]["sigma"] / logs[stuck]["generations"][-1]["sigma"]) == 34
     hundreds = [curves[stuck][1][start : start + 100].mean() for start in range(0, 600, 100)]
     assert max(hundreds) < 0 and official_returns([searches[stuck]]).max() < 800
-    assert (round(mean["input_output", 1]), *(round(c.max()) for c in curves["input_output", 1][:0:-1])) == (
-        730,
-        937,
-        918,
-    )
+    assert (round(mean["input_output", 1]), round(curves["input_output", 1][1].max())) == (730, 918)
     assert (round(mean["frame", 1]), round(curves["frame", 1][2].max())) == (337, 920)
     last = looks["frame", 0]
     assert last[-5:].argmax() == last[-5:].tolist().index(last.max()) == 3
@@ -499,7 +485,6 @@ def test_the_words_on_the_second_v_of_frame_hold_for_the_records():
     last = [f"{learning_curve(folder)[1][-5:].mean():.0f}" for folder in (own, *first, *found)]
     told = f"it has {last[0]}, the two on the first V {last[1]} and {last[2]}, the four {', '.join(last[3:])}"
     assert told in RESULTS and max(last) == last[0]
-    assert f"with {last[0]} against {min(last[3:])} to {max(last[3:])}" in NOTEBOOK
     curves = [fitness_curves(load_json(folder / LOG)["generations"])[1] for folder in (own, *first, *found)]
     hundreds = np.array([[curve[start : start + 100].mean() for start in range(0, 600, 100)] for curve in curves])
     mine, four = [f"{mean:.0f}" for mean in hundreds[0]], hundreds[3:]

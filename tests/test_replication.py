@@ -147,7 +147,7 @@ def test_no_row_is_left_out_of_a_figure_however_many_there_are():
     assert len(returns.axes[0].collections) == len(rows)
 
 
-def test_a_band_goes_from_the_lowest_to_the_highest_seed(table):
+def test_a_band_goes_from_the_lowest_to_the_highest_seed_and_each_is_a_line_in_it(table):
     logs = [load_json(table[0] / "two" / f"seed{seed}" / "evolution.json") for seed in (0, 1)]
     curves = np.stack([fitness_curves(log["generations"]) for log in logs])
     figure = plot_seeds({"two": curves}, "Evolution", window=2)
@@ -156,6 +156,7 @@ def test_a_band_goes_from_the_lowest_to_the_highest_seed(table):
         band = axis.collections[0].get_paths()[0].vertices[:, 1]
         assert (band.min(), band.max()) == pytest.approx((smooth.min(), smooth.max()))
         assert axis.lines[0].get_ydata() == pytest.approx(smooth.mean(axis=0))
+        assert np.array([line.get_ydata() for line in axis.lines[1:3]]) == pytest.approx(smooth)
 
 
 def test_a_run_shorter_than_the_window_is_drawn_at_its_mean():
