@@ -498,37 +498,44 @@ def test_the_words_on_the_second_v_of_frame_hold_for_the_records():
 
 def test_the_words_on_the_rows_without_the_bar_hold_for_the_records():
     rows = kept_rows()
-    returns = {ROWS[name].variant: official_returns(rows[name]) for name in rows if name.startswith("no_bar")}
-    assert set(returns) == set(VARIANTS)
-    blind, base = returns["frame"], official_returns(rows["one_round"])
-    mean = {variant: float(found.mean()) for variant, found in returns.items()}
-    told = "have {input:.1f} (`input`), {frame:.1f} (`frame`), {output:.1f} (`output`) and {input_output:.1f} (`input_o"
-    assert told.format(**mean) in RESULTS
-    lead = {variant: score - mean["frame"] for variant, score in mean.items()}
-    low, high = zip(*(bootstrap_gain(blind, returns[variant]) for variant in VARIANTS), strict=True)
-    behind = "`{}` is {:.1f} points behind `frame` ({:.1f} behind to {:.1f} ahead, for the luck in the tracks alone)"
-    told = behind.format("input", -lead["input"], -low[1], high[1])
-    told += (
-        f", `output` {-lead['output']:.1f} behind ({-low[2]:.1f} behind to {high[2]:.1f} ahead), and `input_output` "
-    )
-    assert f"{told}{lead['input_output']:.1f} ahead ({low[3]:.1f} to {high[3]:.1f})" in RESULTS
-    told = f"a lead of {lead['input_output']:.0f} points over `frame`, in the paper's direction"
-    assert f"{told} ({low[3]:.0f} to {high[3]:.0f}, for the luck" in RESULTS
-    laps = {variant: int((found >= 900).sum()) for variant, found in returns.items()}
-    failed = {variant: int((found < 800).sum()) for variant, found in returns.items()}
-    assert failed == {"frame": 18, "input": 18, "output": 17, "input_output": 4}
-    told = f"has {mean['input_output']:.0f}, with {laps['input_output']} complete laps of 100 and 4 drives below 800"
-    others = [f"{mean[v]:.0f} ({laps[v]} and {failed[v]})" for v in ("frame", "output", "input")]
-    assert told + "; `frame` has {}, `output` {}, `input` {}.".format(*others) in RESULTS
-    told = f"completes {laps['input_output']} laps of 100 where the others complete {laps['frame']} to {laps['output']}"
-    assert told in NOTEBOOK and "810 and 838, and `input_output`, whose z does, 894" in README
-    others = [mean[variant] for variant in ("frame", "input", "output")]
-    assert [round(score) for score in (min(others), mean["output"], max(others))] == [810, 838, 845]
-    assert round(1 / float(ttest_ind(others, [mean["input_output"]]).pvalue)) == 10  # in one case of so many
+    runs = {
+        (ROWS[name].variant, int(folder.name[-1])): official_returns([folder])[0]
+        for name, folders in rows.items()
+        if name.startswith("no_bar")
+        for folder in folders
+    }
+    made = [("frame", 0), ("frame", 1), ("input", 0), ("input_output", 0), ("input_output", 1), ("output", 0)]
+    assert sorted(runs) == made
+    for (variant, seed), found in runs.items():
+        told = [f"{found.mean():.1f}", f"{(found >= 900).sum()}", f"{(found < 800).sum()}"]
+        assert cells(f"`{variant}`, seed {seed}", RESULTS) == told
+    mean = {run: float(found.mean()) for run, found in runs.items()}
+    assert [round(mean[run]) for run in made] == [845, 849, 810, 894, 861, 838]
+    told = "{:.1f} and {:.1f} points against {:.1f} and {:.1f} of `frame`"
+    leading, plain = [("input_output", seed) for seed in (0, 1)], [("frame", seed) for seed in (0, 1)]
+    assert told.format(*(mean[run] for run in leading + plain)) in NOTEBOOK
+    assert "have {:.1f} and {:.1f}.".format(mean["input", 0], mean["output", 0]) in NOTEBOOK
+
+    # The leads: of the second runs, of the first, and of both.
+    together = [np.array([runs[run] for run in some]) for some in (plain, leading)]
+    for (before, after), words in (
+        (
+            [some[1:] for some in together],
+            "by {:.1f} points ({:.1f} behind to {:.1f} ahead, for the luck in the tracks",
+        ),
+        ([some[:1] for some in together], "the first lead was {:.1f} ({:.1f} to {:.1f})"),
+        (together, "the lead is {:.1f} points ({:.1f} to {:.1f} over runs and tracks"),
+    ):
+        low, high = bootstrap_gain(before, after)
+        assert words.format(after.mean() - before.mean(), abs(low), high) in RESULTS
+    assert [round(float(np.median(runs[run]))) for run in (plain[1], leading[1])] == [909, 899]
+    scores = [[mean[run] for run in some] for some in (plain, leading)]
+    assert round(1 / float(ttest_ind(*scores).pvalue)) == 5  # in one case of so many
+    others = [score for run, score in mean.items() if run not in leading]
+    assert min(scores[1]) > max(others) and round(1 / float(ttest_ind(others, scores[1]).pvalue)) == 15
+    first = [mean[run] for run in mean if run[1] == 0 and run != leading[0]]
+    assert round(1 / float(ttest_ind(first, [mean[leading[0]]]).pvalue)) == 10
     assert round(max(float(official_returns(folders).max()) for folders in rows.values())) == 944
-    scatter = base.mean(axis=1).std(ddof=1) * np.sqrt(2)
-    apart = [abs(lead[variant]) / scatter for variant in ("input", "input_output")]
-    assert [round(1 / (2 * t.sf(far, 2))) for far in apart] == [2, 3]  # in one case of so many
 
 
 def test_the_words_on_luck_in_the_searches_hold_for_the_records():
