@@ -141,6 +141,24 @@ def test_the_table_of_the_probe_is_the_study_s():
         assert cells(", ".join([f"z of `{name}`", *untrained]), LATENTS) == values
 
 
+def test_the_table_of_the_v_s_without_the_bar_is_that_of_their_probes():
+    asked = [("random driver", "yaw rate", "z")]
+    asked += [("trained agent", name, "z") for name in ("yaw rate", "slip speed", "wheel angle", "forward speed")]
+    asked.append(("trained agent", "yaw rate", "z, h"))
+    files = sorted((RECORDS / "probe").glob("*.json"))
+    assert len(files) == 4
+    for file in files:
+        row, seed = file.stem.rsplit("_", 1)
+        folder, found = RECORDS / "table" / row / f"seed{seed}", load_json(file)
+        log = load_json(folder / LOG)
+        assert [log[part] for part in ("autoencoder", "mdn_rnn")] == [found["autoencoder"], found["mdn_rnn"]]
+        told = [f"{found['drivers'][driver][features][name]['r2'] + 0.0:.2f}" for driver, name, features in asked]
+        mean = load_json(folder / "evaluation.json")["mean"]
+        assert cells(f"`{row}`, seed {seed}", LATENTS) == [*told, f"{mean:.1f}"]
+    variants = read("study.json")["probe"]["variants"]
+    assert round(variants["random driver"]["input_output"]["z"]["yaw rate"]["r2"], 2) == 0.48
+
+
 def test_the_words_on_the_probe_hold_for_the_study():
     def r2(part, source, quantity, features="z"):
         return round(read("study.json")[part]["variants"]["random driver"][source][features][quantity]["r2"], 2)
