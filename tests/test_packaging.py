@@ -196,6 +196,14 @@ def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     assert "check_environment()" in "".join(next(cell["source"] for cell in cells if cell["cell_type"] == "code"))
 
 
+@pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)
+def test_no_figure_is_lost_because_a_cell_goes_on_after_it_is_shown(file):
+    for cell in json.loads(file.read_text(encoding="utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            *before, _ = ast.parse("".join(cell["source"])).body
+            assert not any(ast.unparse(one).startswith(("show(", "show_")) for one in before), cell["id"]
+
+
 def test_ci_runs_the_one_test_command_of_the_readme():
     commands = [line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("python3 ")]
     assert [command.split("/")[-1].split()[0] for command in commands] == ["jupyter", "pytest"]
