@@ -104,6 +104,11 @@ def add_scheduler(command: argparse.ArgumentParser) -> None:
     )
 
 
+def add_processes(command: argparse.ArgumentParser) -> None:
+    """The option --processes."""
+    command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
+
+
 def add_changes(command: argparse.ArgumentParser, what: str) -> None:
     """The option --set."""
     command.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help=what)
@@ -243,7 +248,7 @@ def add_evaluate(commands: argparse._SubParsersAction) -> None:
     command.add_argument("--episodes", type=int, default=100, help="number of tracks, default 100")
     command.add_argument("--first-track", type=int, default=0, help="seed of the first track, default 0")
     command.add_argument("--fast", action="store_true", help="draw with the fast renderer (not for reports)")
-    command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
+    add_processes(command)
     command.add_argument(
         "--json",
         type=Path,
@@ -365,7 +370,7 @@ def add_probe(commands: argparse._SubParsersAction) -> None:
     add_variant(command)
     add_path(command)
     command.add_argument("--drives", type=int, default=PROBE_DRIVES, help=f"random drives, default {PROBE_DRIVES}")
-    command.add_argument("--processes", type=int, default=2, help="worker processes, default 2")
+    add_processes(command)
     command.add_argument(
         "--json", type=Path, help="where to write the result; default probe-VARIANT.json in the run, or here"
     )
