@@ -23,6 +23,11 @@ def check(
     """
     if found is None:
         raise AssertionError(f"{what} is None: end your function with `return` and the result")
+    if isinstance(found, torch.Tensor) and not isinstance(expected, torch.Tensor):
+        remedy = (
+            "an array, which .numpy() makes of it" if np.ndim(expected) else "a number, which float(...) makes of it"
+        )
+        raise AssertionError(f"{what} is a tensor: expected {remedy}")
     if isinstance(found, str | dict) or isinstance(expected, torch.Tensor) != isinstance(found, torch.Tensor):
         raise AssertionError(f"{what} is of type {type(found).__name__}: expected {type(expected).__name__}")
     if isinstance(found, list | tuple) and isinstance(expected, np.ndarray):

@@ -21,7 +21,7 @@ def test_a_right_answer_passes_and_says_so(capsys):
     [
         (None, "f.x. is None: end your function with `return`"),
         ([0.5, -2.0, 3.0], "is a list: expected an array"),
-        (torch.from_numpy(RIGHT), "is of type Tensor: expected ndarray"),
+        (torch.from_numpy(RIGHT), "is a tensor: expected an array, which .numpy"),
         ("0.5", "is of type str"),
         (RIGHT[:2], r"found shape \(2,\), expected \(3,\)"),
         (RIGHT[None], r"found shape \(1, 3\), expected \(3,\)"),

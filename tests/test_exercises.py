@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
@@ -74,6 +75,22 @@ def test_autograde_gives_the_solution_full_marks_and_the_stub_none(graded):
     assert {cell: full[cell][0] for cell in graded} == {cell: full[cell][1] for cell in graded}
     assert sum(full[cell][1] for cell in graded) >= 10
     assert {score for score, _ in scores(root, name, "stub").values()} == {0}
+
+
+@pytest.mark.parametrize("graded", GRADED, indirect=True)
+def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(graded, monkeypatch, capsys):
+    root, name = graded
+    points = {grading(cell)["grade_id"]: grading(cell) for cell in read_cells(SOURCES[name]) if grading(cell)["grade"]}
+    machine = sum(cell["points"] for cell in points.values() if not cell["solution"])
+    read_by_hand = next(grade_id for grade_id, cell in points.items() if cell["solution"])
+    with Gradebook(f"sqlite:///{root / 'gradebook.db'}") as gradebook:
+        gradebook.find_grade(read_by_hand, name, name, "stub").manual_score = 1.5
+        gradebook.db.commit()
+    monkeypatch.chdir(root)
+    monkeypatch.setattr("sys.argv", ["marks.py", name])
+    runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
+    told = ["student,machine,person,mark", f"solution,{machine:.1f},0.0,{machine / 2}", "stub,0.0,1.5,1.5"]
+    assert capsys.readouterr().out.splitlines() == told
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -295,6 +312,7 @@ WRONG = [
         "solved = active\nactive = lambda kl, threshold=0.05: solved(kl)",
         "threshold is not used",
     ),
+    ("02", "active-check", "active = lambda kl: torch.tensor([3, 0, 1])", "expected an array, which .numpy"),
     ("02", "silence-check", "def silence(z, latents): z[:, latents] = 0; return z", "changed the z"),
     ("02", "silence-check", "def silence(z, latents): z = z.clone(); z[[1]] = 0; return z", "you silenced pictures"),
     (
@@ -311,6 +329,12 @@ WRONG = [
         "    mu, turned = vae.encode(frame, difference)[0], vae.encode(frame, -difference)[0]\n"
         "    return float((mu - turned)[50:].norm() / (mu[50:] - mu[:-50]).norm())",
         "one norm over all frames",
+    ),
+    (
+        "02",
+        "reaction-check",
+        "solved = reaction\ndef reaction(*given): return torch.tensor(solved(*given))",
+        "expected a number, which float",
     ),
     ("02", "reaction-check", "solved = reaction\ndef reaction(*given): return 1 / solved(*given)", "upside down"),
     (
@@ -332,6 +356,12 @@ WRONG = [
         "90% interval",
     ),
     (
+        "02",
+        "mean-interval-check",
+        "mean_interval = lambda values, rng: values.mean() + np.array([-1.96, 1.96]) * values.std() / 12**0.5",
+        "the formula with 1.96",
+    ),
+    (
         "03",
         "log-density-values",
         "solved = log_density\nlog_density = lambda logpi, mean, s, target: solved(0 * logpi, mean, s, target)",
@@ -342,6 +372,27 @@ WRONG = [
         "log-density-values",
         "solved = log_density\nlog_density = lambda *given: -solved(*given)",
         "sign is turned round",
+    ),
+    (
+        "03",
+        "log-density-values",
+        "def log_density(logpi, mean, logsigma, target):\n"
+        "    error = (target[..., None] - mean) / logsigma.exp()\n"
+        "    return torch.logsumexp(logpi - error**2 - logsigma - 0.5 * np.log(2 * np.pi), -1)",
+        "factor 1/2 before the square",
+    ),
+    (
+        "03",
+        "log-density-values",
+        "solved = log_density\nlog_density = lambda logpi, mean, s, target: solved(logpi, mean, s / 2, target)",
+        "not ln sigma squared as in 02",
+    ),
+    (
+        "03",
+        "log-density-values",
+        "log_density = lambda pi, mean, s, target: "
+        "(pi * torch.distributions.Normal(mean, s.exp()).log_prob(target[..., None]).exp()).sum(-1).log()",
+        "logarithms of negative numbers",
     ),
     (
         "03",
@@ -362,6 +413,27 @@ WRONG = [
         "moments = lambda p, m, s: ((p.exp() * m).sum(-1), (p.exp() * (2 * s).exp()).sum(-1).sqrt())",
         "the parts lie apart",
     ),
+    (
+        "03",
+        "moments-check",
+        "solved = moments\nmoments = lambda p, m, s: (solved(p, m, s)[0], solved(p, m, s - 50)[1])",
+        "the parts are wide",
+    ),
+    (
+        "03",
+        "moments-check",
+        "def moments(logpi, mean, logsigma):\n"
+        "    center, within = (logpi.exp() * mean).sum(-1), (logpi.exp() * (2 * logsigma).exp()).sum(-1)\n"
+        "    return center, (within + ((mean - center[..., None]) ** 2).mean(-1)).sqrt()",
+        "weigh the squares",
+    ),
+    (
+        "03",
+        "moments-check",
+        "solved = moments\nmoments = lambda p, m, s: solved(p, m, s / 2)",
+        "its square exp",
+    ),
+    ("03", "moments-check", "solved = moments\nmoments = lambda p, m, s: solved(p, m, s)[0]", "return mean, deviation"),
     ("03", "moments-check", "moments = lambda p, m, s: (m.mean(-1), s.mean(-1))", "weigh each mean"),
     (
         "03",
@@ -463,6 +535,12 @@ WRONG = [
     ("04", "new-mean-check", "new_mean = lambda population, cost: weights(10) @ population[:5]", "was not sorted"),
     (
         "04",
+        "new-mean-check",
+        "new_mean = lambda population, cost: weights(10) @ population[np.argsort(np.argsort(cost))[:5]]",
+        "rows at the ranks",
+    ),
+    (
+        "04",
         "ablate-check",
         "def ablate(c, columns): c[:-3].reshape(3, 288)[:, columns] = 0; return c",
         "changed the vector",
@@ -517,6 +595,19 @@ def test_a_typical_wrong_answer_earns_the_message_that_names_it(moments, number,
     exec(answer, names)
     with pytest.raises(AssertionError, match=message):
         exec(source, names)
+
+
+def test_right_answers_of_another_form_pass_and_serve_the_cells_after_them(moments):
+    names, source = moments["03", "moments-check"]
+    names = dict(names)
+    exec("solved = moments\nmoments = lambda *mixture: list(solved(*mixture))", names)
+    exec(source, names)
+    names = dict(moments["02", "the end"][0])  # latents in an array that runs backwards, which PyTorch takes for none
+    exec("def active(kl, least=0.05): return np.argsort(kl.mean(0))[::-1][: (kl.mean(0) > least).sum()]", names)
+    exec(moments["02", "active-check"][1], names)
+    names |= {"frames": names["frames"][:60], "before": names["before"][:60]}
+    (silencing,) = [cell["source"] for cell in read_cells(SOURCES[NAMES[1]]) if "lively[:5]" in cell["source"]]
+    exec(silencing, names)
 
 
 def test_cells_that_read_what_comes_along_find_it(moments):
