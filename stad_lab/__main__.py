@@ -454,7 +454,7 @@ def add_film(commands: argparse._SubParsersAction) -> None:
     command = commands.add_parser(
         "film",
         help="make a moving picture of an agent driving",
-        description="Observation, difference image and reconstruction side by side, as an animated GIF.",
+        description="Observation, difference image, reconstruction and dream side by side, as an animated GIF.",
     )
     add_variant(command)
     add_path(command)

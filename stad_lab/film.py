@@ -1,18 +1,22 @@
-"""Films of an agent driving: what the car shows, what changes, and what V makes of it, side by side."""
+"""Films of an agent driving: what the car shows, what changes, what V makes of it and what it dreams, side by side."""
 
+import numpy as np
 import torch
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent
 from stad_lab.autoencoder import to_array, to_pictures, to_uint8
+from stad_lab.dream import dream_on
 from stad_lab.drives import FRAMES_A_SECOND, Drive, Inside, look_inside, record_drive
 from stad_lab.frames import earlier_frames
 from stad_lab.plots import check_kind, difference_colors, moving_figure, moving_picture, plot_moment
 
+NAP = 100  # frames of a dream, two seconds: long enough to see it leave the drive, short enough to compare
+
 
 @torch.no_grad()
 def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3) -> bytes:
-    """An animated GIF of observation, difference image and reconstruction while the agent drives.
+    """An animated GIF of observation, difference image, reconstruction and dream while the agent drives.
 
     Args:
         track: seed of the track.
@@ -32,8 +36,25 @@ def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3
         "what the car shows": drive.observations[shown],
         "what changes": difference_colors(to_array(difference)),
         "what V makes of it": to_uint8(agent.autoencoder.reconstruct(frame, difference)[0]),
+        "what it dreams": naps(agent, drive, first)[::every],
     }
     return moving_picture(columns, fps=FRAMES_A_SECOND / every)
+
+
+def naps(agent: Agent, drive: Drive, first: int, length: int = NAP) -> np.ndarray:
+    """The dreams of an agent that falls asleep at frame `first` of its own drive, and is woken every `length` frames.
+
+    Returns:
+        One picture for each frame from `first` on, uint8 (len(drive) - first, 64, 64, 3). While it sleeps, the agent
+        drives in the dream, and every dream begins with what M expects to see next.
+    """
+    agent.reset()
+    dreams = []
+    for moment, observation in enumerate(drive.observations):
+        agent.act(observation)  # as it did in the drive: this gives the agent its memory of that moment back
+        if moment >= first and (moment - first) % length == 0:
+            dreams.append(dream_on(agent, min(length, len(drive) - moment), seed=len(dreams))[0])
+    return np.concatenate(dreams)
 
 
 def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 3, kind: str = "gif") -> bytes:

@@ -10,6 +10,8 @@ from gymnasium.utils.env_checker import check_env
 from stad_lab.agent import Agent
 from stad_lab.controller import control
 from stad_lab.dream import DreamEnv, dream_on
+from stad_lab.drives import record_drive
+from stad_lab.film import naps
 
 ACTION = np.array([0.1, 0.5, 0], np.float32)
 
@@ -155,6 +157,20 @@ def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent,
         _, state = agent.mdn_rnn(z[None, None], torch.from_numpy(action)[None, None], state)
         z = torch.from_numpy(latents)
         assert info["hidden"] == pytest.approx(state[0][0, 0].numpy(), abs=1e-5)
+
+
+def test_an_agent_in_a_film_dreams_on_from_its_own_drive_and_is_woken_in_time(agent):
+    drive = record_drive(agent, track=3, frames=25)
+    dreams = naps(agent, drive, first=6, length=8)
+    assert dreams.shape == (len(drive) - 6, 64, 64, 3)
+    for nap, moment in enumerate((6, 14, 22)):
+        agent.reset()
+        for observation in drive.observations[: moment + 1]:
+            action = agent.act(observation)
+        assert np.array_equal(action, drive.actions[moment])
+        length = min(8, len(drive) - moment)
+        dream, _ = dream_on(agent, length, seed=nap)
+        assert np.array_equal(dreams[moment - 6 :][:length], dream)
 
 
 def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
