@@ -13,9 +13,10 @@ from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-from stad_lab.environment import check_environment
+from stad_lab.environment import check_environment, escape_foreign_letters
 
 if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports that a broken installation would fail
+    escape_foreign_letters()
     print(report := check_environment())
     sys.exit(0 if report.ok else 1)
 
@@ -64,12 +65,14 @@ def build_parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status. Errors of the user's making end in one line, not in a traceback."""
     options = build_parser().parse_args(arguments)
-    if hasattr(sys.stdout, "reconfigure"):  # a folder's name may have letters that the console has not
-        sys.stdout.reconfigure(errors="backslashreplace")
+    escape_foreign_letters()
     try:
         return options.do(options) or 0
     except (ValueError, OSError, FloatingPointError, TaskError, BrokenProcessPool) as error:
         print(f"error: {error}", file=sys.stderr)
+        return 2
+    except (MemoryError, OverflowError) as error:
+        print(f"error: too large for this machine: {error or type(error).__name__}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if options.resumes else ""
@@ -281,7 +284,8 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
         "verify",
         help="check a run's files, and drive three of its recorded episodes again",
         description="Check that the files of a run are what they were and belong together, and that recorded episodes"
-        " can be driven again to the same return. The exit status is 1 if anything is not as it was.",
+        " can be driven again to the same return. The exit status is 1 if a file is not as it was, or if a drive is not"
+        " on the kind of machine that the record names.",
     )
     command.add_argument("run", type=Path, help="folder of the run")
     command.set_defaults(do=do_verify)

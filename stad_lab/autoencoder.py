@@ -272,7 +272,7 @@ def train_autoencoder(
     with locked(path.parent):
         history = fit(autoencoder, batch, losses, heldout_losses, steps, rate, checkpoint, label, identity, watch)
         save_autoencoder(path, autoencoder, settings, history, rollouts.identity)
-        checkpoint.unlink(missing_ok=True)  # there is none after 0 steps
+        checkpoint.unlink(missing_ok=True)
     return True
 
 

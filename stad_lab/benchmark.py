@@ -272,8 +272,8 @@ def save_pair(folder: Path, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, settings:
 
 
 def generation_speed(agents: np.ndarray, settings: Settings, executor: Executor, source: Any, number: int) -> float:
-    """Frames a second of all agents together, each on the tracks of the generation of this number."""
-    tracks = track_seeds("evolve", settings.tracks, 9, number) * len(agents)
+    """Frames a second of all agents together, each once for every track of the generation of this number."""
+    tracks = track_seeds("evolve", settings.tracks, 9, number) * (len(agents) // settings.tracks)
     begin = time.perf_counter()
     _, lengths = drive_parallel(executor, source, VARIANT, agents, tracks, settings)
     return lengths.sum() / (time.perf_counter() - begin)

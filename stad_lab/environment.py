@@ -99,6 +99,12 @@ def check_environment(folder: str | Path = ".") -> Report:
     return Report((*lines, *attempt(check_folder, Path(folder))))
 
 
+def escape_foreign_letters() -> None:
+    """From now on print letters that the console does not have, of a folder's name for example, as escapes."""
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
 def attempt(check: Callable[..., Iterator[Line]], *arguments) -> list[Line]:
     """The lines of a check; whatever it raises is one more line, a red one."""
     lines = []

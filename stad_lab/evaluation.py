@@ -20,6 +20,7 @@ from stad_lab.rollouts import TRACK_RANGES
 
 SOLVED = 900  # CarRacing counts as solved at a mean return of 900 over 100 tracks
 RESAMPLES = 10_000  # of a bootstrap
+MOST_EPISODES = 10_000  # of an evaluation: the bootstrap of more would need more than 2 GB
 
 
 def evaluate(
@@ -56,9 +57,9 @@ def evaluate(
         TaskError: an episode failed.
     """
     low, high = TRACK_RANGES["test"]
-    if episodes < 1 or not low <= first_track <= high - episodes:
+    if not 1 <= episodes <= MOST_EPISODES or not low <= first_track <= high - episodes:
         raise ValueError(
-            f"episodes={episodes} from first_track={first_track}: expected at least 1 episode, on tracks"
+            f"episodes={episodes} from first_track={first_track}: expected 1 to {MOST_EPISODES} episodes, on tracks"
             f" {low} to {high - 1}; those above are for training and validation"
         )
     agent, folder, read = load_agent(variant, path), run_folder(variant, path), None
@@ -67,7 +68,8 @@ def evaluate(
     identity = {"variant": variant, "renderer": "fast" if fast else "official", "controller_sha256": read}
     tracks = list(range(first_track, first_track + episodes))
     known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
-    asked = identity | {"tracks": tracks}
+    weights = [checksum((folder / f"{part}.safetensors").read_bytes()) for part in ("autoencoder", "mdn_rnn")]
+    asked = identity | {"tracks": tracks, "weights": weights}  # V and M may be the same but for their precision
     driven = known["driven"] if known.get("identity") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]

@@ -169,7 +169,7 @@ def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldM
     """The log of the run in `folder`, or a new one.
 
     Raises:
-        ValueError: it is damaged, or was made with other settings, another V or another M.
+        ValueError: it is damaged, was made with other settings, another V or another M, or is longer than asked for.
     """
     new = {"variant": variant, "settings": settings.as_dict(), **world_model.identities, "best": None}
     if not (folder / LOG).exists():
@@ -178,6 +178,11 @@ def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldM
     made = {"variant": log["variant"], **log["settings"]}
     check_same_run(folder / LOG, made, {"variant": variant, **new["settings"]})
     check_partner(folder / LOG, log, **world_model.identities)
+    if len(log["generations"]) > settings.generations:
+        raise ValueError(
+            f"{folder / LOG} holds {len(log['generations'])} generations, and now generations={settings.generations} is"
+            " asked for: ask for at least as many, or choose another folder"
+        )
     return log | {"settings": new["settings"]}
 
 

@@ -16,6 +16,7 @@ from stad_lab.agent import load_agent, load_controller, read_world_model
 from stad_lab.autoencoder import check_variant
 from stad_lab.checkpoints import copy_file, load_json, locked
 from stad_lab.evolution import CONTROLLER, evolve
+from stad_lab.mdn_rnn import check_partner
 from stad_lab.parallel import refuse_in_starting_worker
 from stad_lab.pipeline import GIVE_A_RUN, open_record, read_finished, run_stages, set_options
 from stad_lab.search_space import COMPONENTS, START, load_directions, load_start, save_start
@@ -112,5 +113,7 @@ def begin_finish(variant: str, earlier: Path, folder: Path) -> bool:
     if path.exists():
         load_start(path, world_model)
         return False
-    save_start(path, load_controller(earlier / CONTROLLER, variant)[0], variant, world_model)
+    parameters, facts = load_controller(earlier / CONTROLLER, variant)
+    check_partner(earlier / CONTROLLER, facts, **world_model.identities)
+    save_start(path, parameters, variant, world_model)
     return True

@@ -130,4 +130,4 @@ def find_row(name: str, seeds: Sequence[int] | None = None) -> Row:
     for seed in seeds or ():
         if seed not in row.seeds:
             raise ValueError(f"row {name!r} has no seed {seed}: choose of {', '.join(map(str, row.seeds))}")
-    return dataclasses.replace(row, seeds=tuple(seeds)) if seeds else row
+    return dataclasses.replace(row, seeds=tuple(dict.fromkeys(seeds))) if seeds else row

@@ -122,6 +122,11 @@ class Settings:
                 f"generations={self.generations} is not a multiple of validate_every={self.validate_every}: the last"
                 " generation must be one that is validated"
             )
+        if self.sigma_decay and self.sigma * self.sigma_decay**self.generations < SMALLEST_STEP:
+            raise ValueError(
+                f"sigma_decay={self.sigma_decay} shrinks sigma={self.sigma} below {SMALLEST_STEP} in {self.generations}"
+                " generations: use a sigma_decay nearer to 1, or 0 for CMA-ES's own step size"
+            )
         if self.m_sequence >= self.episode_frames:
             raise ValueError(
                 f"m_sequence={self.m_sequence} does not fit into episodes of episode_frames={self.episode_frames}:"
@@ -172,7 +177,18 @@ NO_LESS_THAN_ZERO = (
     "components",
 )
 AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
-AT_MOST = {"episode_frames": 1000, "max_frames": 1000}  # CarRacing ends an episode then
+AT_MOST = {
+    "episode_frames": 1000,  # CarRacing ends an episode then
+    "max_frames": 1000,
+    "processes": 10_000,  # beyond this and the next no machine has the room, and would say so only after hours
+    "episodes": 1_000_000,
+    "width": 1000,
+    "latent_size": 10_000,
+    "hidden_size": 10_000,
+    "mixtures": 1000,
+    "population": 100_000,
+}
+SMALLEST_STEP = 1e-12  # of the search; near 0 CMA-ES cannot compute
 SHARES = ("random_starts", "revisited_share", "averaged_share", "sigma_decay")
 FEATURES = ("z, h", "z", "h")
 

@@ -1,8 +1,10 @@
 """The benchmark: fair turns, parts that add up, contenders that compute the same; the speeds are its own business."""
 
+import dataclasses
 import json
 from concurrent.futures import ThreadPoolExecutor
 
+import numpy as np
 import pytest
 
 from stad_lab.__main__ import main
@@ -57,7 +59,9 @@ def test_agents_drive_with_world_models_sizes(tmp_path):
     agent = load_agent(VARIANT)
     assert read_world_model(tmp_path, VARIANT).autoencoder.width == brief.width > agent.autoencoder.width
     with ThreadPoolExecutor(1) as executor:
-        assert generation_speed(agent.parameters[None], brief, executor, tmp_path, 0) > 0
+        for tracks in (1, 2):
+            agents = np.repeat(agent.parameters[None], 2 * tracks, axis=0)  # two, each once for every track
+            assert generation_speed(agents, dataclasses.replace(brief, tracks=tracks), executor, tmp_path, 0) > 0
 
 
 @pytest.mark.long

@@ -121,9 +121,10 @@ def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straigh
     result = evaluate(*chosen, unfinished=file)
     assert done == [2, 1] and result | {"seconds": 0} == fast | {"seconds": 0}
     drove = load_json(file)
-    save_json(file, drove | {"identity": drove["identity"] | {"controller_sha256": "of another C"}})
     monkeypatch.setattr("stad_lab.evaluation.save_json", refuse_to_write)
-    assert evaluate(*chosen, unfinished=file)["episodes"] == fast["episodes"] and done[-1] == 2
+    for other in ({"controller_sha256": "of another C"}, {"weights": ["of the same V, half as precise", "of M"]}):
+        save_json(file, drove | {"identity": drove["identity"] | other})
+        assert evaluate(*chosen, unfinished=file)["episodes"] == fast["episodes"] and done[-1] == 2
 
 
 def test_the_screen_shows_what_the_summary_says(fast):
@@ -159,9 +160,11 @@ def test_one_episode_has_no_deviation():
     }
 
 
-@pytest.mark.parametrize(("first", "episodes"), [(-1, 1), (TRACK_RANGES["test"][1], 1), (999_950, 100), (0, 0)])
+@pytest.mark.parametrize(
+    ("first", "episodes"), [(-1, 1), (TRACK_RANGES["test"][1], 1), (999_950, 100), (0, 0), (0, 10_001)]
+)
 def test_tracks_outside_the_test_range_are_refused(first, episodes, straight_run):
-    message = f"episodes={episodes} from first_track={first}: expected at least 1 episode, on tracks 0 to 999999"
+    message = f"episodes={episodes} from first_track={first}: expected 1 to 10000 episodes, on tracks 0 to 999999"
     with pytest.raises(ValueError, match=message):
         evaluate("input_output", straight_run, episodes, first)
 

@@ -85,6 +85,15 @@ def test_an_evolution_in_two_parts_equals_one_in_one_go(one_go, first_part, tmp_
     assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
 
 
+def test_fewer_generations_than_there_are_is_refused_before_anything_changes(one_go):
+    before = read(one_go)
+    with pytest.raises(
+        ValueError, match=r"evolution.json holds 6 generations, and now generations=2 .* at least as many"
+    ):
+        evolve("input_output", settings(generations=2), one_go)
+    assert read(one_go) == before
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send to a process")
 def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, quick_run, tmp_path):
     folder = without_evolution(quick_run, tmp_path / "run")

@@ -11,11 +11,11 @@ import pytest
 
 from stad_lab import replication
 from stad_lab.__main__ import main, read_changes
-from stad_lab.agent import load_agent, load_controller, read_world_model
+from stad_lab.agent import PRETRAINED, load_agent, load_controller, read_world_model
 from stad_lab.checkpoints import load_json, save_json
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import LOG, generation_tracks
-from stad_lab.finish import FINISH, finish, finish_settings
+from stad_lab.finish import FINISH, begin_finish, finish, finish_settings
 from stad_lab.pipeline import ship, total_budget
 from stad_lab.rows import ROWS, Row
 from stad_lab.search_space import load_start, search_space
@@ -70,6 +70,13 @@ def test_a_finish_adds_its_episodes_and_agents_to_those_of_before(finished, quic
     assert both["agents"] == first["agents"] + 16 and mine["random"]["episodes"] == 0
     assert both["episodes"] == first["episodes"] + 4 * 4 * 2 + 2 * 2
     assert both["frames"] == first["frames"] + mine["evolution"]["frames"] + mine["validation"]["frames"]
+
+
+def test_a_finish_in_a_folder_with_another_v_and_m_is_refused(quick_run, tmp_path):
+    for part in ("autoencoder", "mdn_rnn"):
+        shutil.copy(PRETRAINED / VARIANT / f"{part}.safetensors", tmp_path)
+    with pytest.raises(ValueError, match=r"controller.safetensors was made with another autoencoder .* C of one run"):
+        begin_finish(VARIANT, quick_run, tmp_path)
 
 
 def test_a_finish_goes_on_where_it_stopped_and_ends_with_the_same_bits(finished, quick_run, tmp_path):

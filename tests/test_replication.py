@@ -280,7 +280,7 @@ def test_an_unknown_seed_ends_in_one_line_that_names_the_seeds(capsys, tmp_path)
 
 def test_some_seeds_of_a_row_can_be_made_alone(table, monkeypatch):
     folder, summaries = table
-    assert replicate("two", folder, seeds=[1])["seeds"] == summaries["two"]["seeds"][1:]
+    assert replicate("two", folder, seeds=[1, 1])["seeds"] == summaries["two"]["seeds"][1:]
     speeds = {"V, M, C": 10.0, "V": 10.0, "M": 10.0, "official": 10.0}
     monkeypatch.setattr(replication, "speeds", lambda *_: speeds)  # measured twice they would differ
     whole, one = forecast("one_round"), forecast("one_round", seeds=[2])

@@ -93,6 +93,9 @@ def test_an_unknown_field_is_refused_with_the_choices(make):
         ("seed", None, "expected int"),
         ("episode_frames", 1500, "expected 1 to 1000"),  # CarRacing ends an episode then
         ("max_frames", 1001, "expected 1 to 1000"),
+        ("processes", 10**9, "expected 1 to 10000"),
+        ("width", 10**6, "expected 1 to 1000"),
+        ("episodes", 10**12, r"expected 2 to 1e\+06"),
         ("name", "mine", "expected the preset"),
     ],
 )
@@ -109,6 +112,10 @@ def test_values_that_do_not_go_together_are_refused():
         Settings(episode_frames=20, stride=30, m_sequence=5)
     with pytest.raises(ValueError, match=r"generations=54 is not a multiple of validate_every=5: the last"):
         Settings(generations=54)
+    with pytest.raises(
+        ValueError, match=r"sigma_decay=0\.5 shrinks sigma=.* in 55 generations: use .* nearer to 1, or 0"
+    ):
+        Settings(sigma_decay=0.5)
 
 
 def test_every_setting_has_its_sentence():
