@@ -146,15 +146,22 @@ def test_the_table_of_the_v_s_without_the_bar_is_that_of_their_probes():
     asked += [("trained agent", name, "z") for name in ("yaw rate", "slip speed", "wheel angle", "forward speed")]
     asked.append(("trained agent", "yaw rate", "z, h"))
     files = sorted((RECORDS / "probe").glob("*.json"))
-    assert len(files) == 4
+    assert len(files) == 6
+    known, means = {}, {}
     for file in files:
         row, seed = file.stem.rsplit("_", 1)
         folder, found = RECORDS / "table" / row / f"seed{seed}", load_json(file)
         log = load_json(folder / LOG)
         assert [log[part] for part in ("autoencoder", "mdn_rnn")] == [found["autoencoder"], found["mdn_rnn"]]
         told = [f"{found['drivers'][driver][features][name]['r2'] + 0.0:.2f}" for driver, name, features in asked]
-        mean = load_json(folder / "evaluation.json")["mean"]
+        known[file.stem] = found["drivers"]["trained agent"]["z"]["yaw rate"]["r2"]
+        means[file.stem] = mean = load_json(folder / "evaluation.json")["mean"]
         assert cells(f"`{row}`, seed {seed}", LATENTS) == [*told, f"{mean:.1f}"]
+    both = [f"no_bar_input_output_{seed}" for seed in (0, 1)]
+    others = sorted(known.keys() - both, key=known.get)
+    assert min(known[run] for run in both) > 0.85 > 0.25 > known[others[-1]]
+    assert others[0] == "no_bar_1" == max(others, key=means.get)
+    assert 5.5 < min(means[run] for run in both) - means["no_bar_1"] < 6.5  # "by six points only"
     variants = read("study.json")["probe"]["variants"]
     assert round(variants["random driver"]["input_output"]["z"]["yaw rate"]["r2"], 2) == 0.48
 
