@@ -284,7 +284,7 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
         "verify",
         help="check a run's files, and drive three of its recorded episodes again",
         description="Check that the files of a run are what they were and belong together, and that recorded episodes"
-        " can be driven again to the same return. The exit status is 1 if a file is not as it was, or if a drive is not"
+        " can be driven again to the same return. The exit status is 1 if a file has changed, or if a drive differs"
         " on the kind of machine that the record names.",
     )
     command.add_argument("run", type=Path, help="folder of the run")

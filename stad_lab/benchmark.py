@@ -271,11 +271,12 @@ def save_pair(folder: Path, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, settings:
     save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, autoencoder.variant, settings, [], identity)
 
 
-def generation_speed(agents: np.ndarray, settings: Settings, executor: Executor, source: Any, number: int) -> float:
-    """Frames a second of all agents together, each once for every track of the generation of this number."""
-    tracks = track_seeds("evolve", settings.tracks, 9, number) * (len(agents) // settings.tracks)
+def generation_speed(population: np.ndarray, settings: Settings, executor: Executor, source: Any, number: int) -> float:
+    """Frames a second of all agents together, each on the tracks of the generation of this number."""
+    tracks = track_seeds("evolve", settings.tracks, 9, number)
+    agents = np.repeat(population, len(tracks), axis=0)
     begin = time.perf_counter()
-    _, lengths = drive_parallel(executor, source, VARIANT, agents, tracks, settings)
+    _, lengths = drive_parallel(executor, source, VARIANT, agents, tracks * len(population), settings)
     return lengths.sum() / (time.perf_counter() - begin)
 
 
@@ -473,7 +474,7 @@ def measure_cluster(rounds: int) -> dict:
 
     settings = Settings.preset("laptop", population=16, tracks=4, max_frames=100, patience=0)
     agent = load_agent(VARIANT)
-    agents = np.repeat(agent.parameters[None], settings.population * settings.tracks, axis=0)
+    population = np.repeat(agent.parameters[None], settings.population, axis=0)
     address = {"threads_per_worker": 1, "dashboard_address": None}
     with (
         worker_processes(1) as one,
@@ -483,7 +484,7 @@ def measure_cluster(rounds: int) -> dict:
         cluster(small.scheduler_address) as dask_one,
         cluster(large.scheduler_address) as dask_two,
     ):
-        speed = functools.partial(generation_speed, agents, settings)
+        speed = functools.partial(generation_speed, population, settings)
         executors = {"own processes, 1": one, "own processes, 2": two}
         executors |= {"Dask, 1 worker": dask_one, "Dask, 2 workers": dask_two}
         contenders = {

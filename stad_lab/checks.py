@@ -28,7 +28,7 @@ def check(
             "an array, which .numpy() makes of it" if np.ndim(expected) else "a number, which float(...) makes of it"
         )
         raise AssertionError(f"{what} is a tensor: expected {remedy}")
-    if isinstance(found, str | dict) or isinstance(expected, torch.Tensor) != isinstance(found, torch.Tensor):
+    if isinstance(found, str | dict) or (isinstance(expected, torch.Tensor) and not isinstance(found, torch.Tensor)):
         raise AssertionError(f"{what} is of type {type(found).__name__}: expected {type(expected).__name__}")
     if isinstance(found, list | tuple) and isinstance(expected, np.ndarray):
         raise AssertionError(f"{what} is a {type(found).__name__}: expected an array; wrap it in np.array(...)")

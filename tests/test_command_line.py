@@ -199,6 +199,13 @@ def test_a_film_is_a_moving_picture(name, options, quick_run, tmp_path, capsys):
     assert not np.array_equal(pictures[0], pictures[-1])
 
 
+def test_a_number_too_large_for_any_machine_ends_in_one_line(quick_run, tmp_path, capsys):
+    file = tmp_path / "evaluation.json"
+    command = ["evaluate", "--variant", "input_output", "--path", quick_run, "--json", file, "--processes", 2**31]
+    assert main([str(argument) for argument in command]) == 2
+    assert "error: too large for this machine: " in capsys.readouterr().err and not file.exists()
+
+
 def test_a_film_of_no_frame_is_refused_before_the_drive(agent):
     with pytest.raises(ValueError, match="every=0: expected at least 1"):
         film_agent(agent, track=0, first=0, frames=10, every=0)
