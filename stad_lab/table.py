@@ -29,7 +29,7 @@ OTHERS = {  # the rest of that table
     "World Models": 906.0,
 }
 RECIPES = {  # rows RECIPE_VARIANT, and what the picture of the replication calls them
-    "paper": "its recipe here, v3",
+    "paper": "the paper's recipe here, v3",
     "two_rounds": "our recipe, v3",
     "finished": "ours, finished",
 }
