@@ -93,7 +93,7 @@ def test_m_s_speed_is_measured():
 
 
 def test_the_command_writes_every_measurement(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("stad_lab.benchmark.MAX_FRAMES", 100)  # of an episode
+    monkeypatch.setattr("stad_lab.benchmark.MAX_FRAMES", 30)  # of an episode
     assert main(["benchmark", "--part", "renderer", "--rounds", "1", "--json", str(tmp_path / "benchmark.json")]) == 0
     printed = capsys.readouterr().out
     result = json.loads((tmp_path / "benchmark.json").read_text())

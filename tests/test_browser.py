@@ -154,18 +154,6 @@ view_drive(drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.str
 )
 
 
-def test_a_moved_slider_draws_another_figure_in_every_widget_that_has_one(run):
-    cells = run(*SLIDERS).locator(".jp-CodeCell")
-    for number, pictures in ((0, 1), (1, 2), (2, 1)):
-        cell = cells.nth(number)
-        handles = cell.locator(".noUi-handle")
-        handles.first.wait_for(timeout=1000 * SLOW)
-        assert handles.count() == (32 if number == 1 else 1)
-        for place in range(pictures):
-            picture = cell.locator(".jp-OutputArea-output img").nth(place)
-            sees_another_picture(picture, lambda handles=handles: handles.first.press("ArrowRight"))
-
-
 SOURCE = """
 from stad_lab.frames import difference_image
 from stad_lab.widgets import show_source
@@ -178,12 +166,22 @@ LIGHTS = r"""pre => {
 }"""
 
 
-def test_source_code_can_be_read_in_the_dark_theme(run):
-    page = run(SOURCE)
-    paper, *inks = page.locator(".jp-OutputArea-output pre").last.evaluate(LIGHTS, timeout=1000 * SLOW)
+def test_source_code_can_be_read_in_the_dark_theme_and_a_moved_slider_draws_another_figure_in_every_widget(run):
+    page = run(SOURCE, *SLIDERS)  # one page for both: a kernel takes seconds to start
+    cells = page.locator(".jp-CodeCell")
+    paper, *inks = cells.first.locator(".jp-OutputArea-output pre").last.evaluate(LIGHTS, timeout=1000 * SLOW)
     assert page.locator("body").get_attribute("data-jp-theme-light") == "false"
     assert min(paper) > 240 and len(inks) > 20
     assert max(sum(ink) / 3 for ink in inks) < 175
+
+    for number, pictures, sliders in ((1, 1, 1), (2, 2, 32), (3, 1, 1)):
+        cell = cells.nth(number)
+        handles = cell.locator(".noUi-handle")
+        handles.first.wait_for(timeout=1000 * SLOW)
+        assert handles.count() == sliders
+        for place in range(pictures):
+            picture = cell.locator(".jp-OutputArea-output img").nth(place)
+            sees_another_picture(picture, lambda handles=handles: handles.first.press("ArrowRight"))
 
 
 SEAT = """

@@ -59,6 +59,12 @@ def drive_both(driver, seed, frames=MAX_FRAMES, pictures=True):
     return [step[0] for step in steps], [step[1] for step in steps]
 
 
+@pytest.fixture(scope="module")
+def long_drive():
+    """Four hundred frames on the road, with unmodified Gymnasium."""
+    return drive_both(follow_road, 26, 400)
+
+
 def assert_equal_to_the_last_bit(fast, official):
     """Rewards, terminations, truncations and infos."""
     assert [step[1:] for step in fast] == [step[1:] for step in official]
@@ -71,26 +77,26 @@ def differences(fast, official, rows=slice(None)):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_rewards_equal_to_the_last_bit_on_the_road(seed):
-    fast, official = drive_both(follow_road, seed, 120)
+    fast, official = drive_both(follow_road, seed, 120, pictures=False)
     assert sum(step[1] for step in fast) > 40  # it was on the road
     assert_equal_to_the_last_bit(fast, official)
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
 def test_rewards_equal_to_the_last_bit_off_the_road(seed):
-    fast, official = drive_both(wild, seed, 120)
+    fast, official = drive_both(wild, seed, 120, pictures=False)
     assert_equal_to_the_last_bit(fast, official)
 
 
-def test_rewards_equal_to_the_last_bit_in_a_long_episode_of_unmodified_gymnasium():
-    fast, official = drive_both(follow_road, 6, 400)
+def test_rewards_equal_to_the_last_bit_in_a_long_episode_of_unmodified_gymnasium(long_drive):
+    fast, official = long_drive
     assert len(fast) == 400
     assert_equal_to_the_last_bit(fast, official)
 
 
-@pytest.mark.parametrize("seed", [6, 11, 16])
+@pytest.mark.parametrize("seed", [6, 11])
 def test_rewards_equal_to_the_last_bit_off_the_field(seed):
-    fast, official = drive_both(leave_field, seed, pictures=seed == 6)
+    fast, official = drive_both(leave_field, seed, pictures=False)
     assert fast[-1][1:4] == (-100, True, False)
     assert fast[-1][4] == {"lap_finished": False}
     assert_equal_to_the_last_bit(fast, official)
@@ -111,7 +117,7 @@ def test_rewards_equal_to_the_last_bit_to_the_end_of_a_lap():
 
 
 def test_pictures_of_20_episodes_are_gymnasium_s_to_half_a_level_and_around_the_car_to_four():
-    episodes = [compare_pictures(number, frames=40) for number in range(20)]
+    episodes = [compare_pictures(number, frames=20) for number in range(20)]
     assert all(equal for _, equal in episodes)
     whole, window, bar = np.concatenate([errors for errors, _ in episodes]).mean(axis=0)
     assert whole <= 0.5
@@ -119,15 +125,16 @@ def test_pictures_of_20_episodes_are_gymnasium_s_to_half_a_level_and_around_the_
     assert bar <= 0.5
 
 
-def test_pictures_differ_by_less_than_one_level_in_the_opening_zoom():
-    fast, official = drive_both(follow_road, 21, 50)
+def test_pictures_differ_by_less_than_one_level_in_the_opening_zoom(long_drive):
+    fast, official = (steps[:50] for steps in long_drive)
     errors = differences([step[0] for step in fast], [step[0] for step in official])
     assert max(errors) <= 1
 
 
-@pytest.mark.parametrize(("driver", "seed"), [(follow_road, 22), (wild, 23)])
-def test_pictures_differ_by_less_than_one_level_on_average_on_and_off_the_road(driver, seed):
-    fast, official = drive_both(driver, seed, 160)
+@pytest.mark.parametrize("where", ["on the road", "off the road"])
+def test_pictures_differ_by_less_than_one_level_on_average_on_and_off_the_road(where, long_drive):
+    fast, official = long_drive if where == "on the road" else drive_both(wild, 23, 160)
+    assert_equal_to_the_last_bit(fast, official)
     fast, official = [step[0] for step in fast], [step[0] for step in official]
     assert np.mean(differences(fast, official)) <= 1
     assert max(differences(fast, official)) <= 1.5
@@ -137,6 +144,8 @@ def test_pictures_differ_by_less_than_one_level_on_average_on_and_off_the_road(d
 
 def test_pictures_differ_by_less_than_one_level_near_the_edge_of_the_field():
     fast, official = drive_both(leave_field, 16)
+    assert fast[-1][1:4] == (-100, True, False)
+    assert_equal_to_the_last_bit(fast, official)
     fast, official = [step[0] for step in fast[-60:]], [step[0] for step in official[-60:]]
     assert max(differences(fast, official)) <= 1
 
@@ -158,17 +167,16 @@ def test_pictures_differ_by_less_than_one_level_in_random_colours():
     plain = make_env(fast=True).reset(seed=25)[0]
     for options in (None, {"randomize": True}):
         pictures = [[env.reset(seed=25, options=options)[0]] for env in (fast, official)]
-        for _ in range(60):
+        for _ in range(30):
             for env, seen in zip((fast, official), pictures, strict=True):
                 seen.append(env.step(STRAIGHT)[0])
         assert np.mean(differences(*pictures)) <= 1
         assert differences([plain], [pictures[0][0]])[0] > 5  # the colours did change
 
 
-def test_visited_tiles_change_colour_as_in_gymnasium():
-    fast, official = drive_both(follow_road, 26, 100)
+def test_visited_tiles_change_colour_as_in_gymnasium(long_drive):
     behind = (slice(78, BAR_TOP), slice(30, 66))  # road that the car has just passed
-    fast, official = (np.array([step[0][behind] for step in steps[60:]]) for steps in (fast, official))
+    fast, official = (np.array([step[0][behind] for step in steps[60:100]]) for steps in long_drive)
     visited = (official == official[0, -1, 20]).all(axis=-1)
     assert visited.mean() > 0.5
     assert (fast[visited] == official[visited]).mean() > 0.98

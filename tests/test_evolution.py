@@ -241,11 +241,17 @@ def test_the_share_of_revisited_tracks_holds_over_the_generations_for_any_number
 
 
 def test_going_back_to_hard_tracks_survives_an_interruption(quick_run, tmp_path):
-    stopped, straight = (without_evolution(quick_run, tmp_path / name) for name in ("stopped", "straight"))
-    back = {"revisited_share": 0.5, "processes": 1}
-    evolve("input_output", settings(generations=6, **back), stopped)
-    for folder in (stopped, straight):
-        evolve("input_output", settings(generations=8, **back), folder)
+    stopped, straight = tmp_path / "stopped", without_evolution(quick_run, tmp_path / "straight")
+    back = settings(generations=8, revisited_share=0.5, max_frames=20, validation_tracks=1)
+
+    def watch(generations):
+        if len(generations) == 6:
+            shutil.copytree(straight, stopped)  # what is left if it is killed at this moment
+
+    with ThreadPoolExecutor(1) as executor:
+        evolve("input_output", back, straight, executor, watch)
+        assert len(read(stopped)["generations"]) == 6
+        evolve("input_output", back, stopped, executor)
     assert read(stopped)["generations"] == read(straight)["generations"]
     tracks = [entry["tracks"][0] for entry in read(straight)["generations"]]
     assert tracks[5] == tracks[0] and tracks[7] in tracks[:3]

@@ -21,7 +21,7 @@ from stad_lab import evolution, pipeline
 from stad_lab.__main__ import main
 from stad_lab.agent import load_agent
 from stad_lab.autoencoder import train_autoencoder
-from stad_lab.checkpoints import load_json, load_tensors, save_json, write_bytes
+from stad_lab.checkpoints import checksum, load_json, load_tensors, save_json, write_bytes
 from stad_lab.evaluation import evaluate
 from stad_lab.evolution import evolve
 from stad_lab.mdn_rnn import train_mdn_rnn
@@ -57,11 +57,12 @@ def whole(quick_run, tmp_path_factory, in_this_process):
 
 
 @pytest.fixture(scope="module")
-def another(tmp_path_factory, in_this_process):
+def another(tmp_path_factory, whole, in_this_process):
     """A run of another seed, with checkpoints too."""
-    folder, settings = tmp_path_factory.mktemp("faults") / "another", Settings.preset("quick", seed=1)
+    folder, settings = tmp_path_factory.mktemp("faults") / "another", Settings.preset("quick", seed=1, generations=2)
     train(VARIANT, settings, folder, executor=in_this_process)
-    save_json(folder / "evaluation.json", evaluate(VARIANT, folder, 1, fast=True, executor=in_this_process))
+    own = {"controller_sha256": checksum((folder / "controller.safetensors").read_bytes())}
+    save_json(folder / "evaluation.json", load_json(whole / "evaluation.json") | own)
     add_checkpoints(folder, settings)
     return folder
 
@@ -332,7 +333,7 @@ def test_work_of_a_killed_worker_is_done_again(tmp_path, capfd):
 def test_work_of_a_stuck_worker_is_done_again(tmp_path, capfd):
     with worker_processes(1) as executor:
         list(run_tasks(executor, int, [()]))  # from now on a worker starts at once
-    with worker_processes(1, time_limit=3) as executor:
+    with worker_processes(1, time_limit=1.5) as executor:
         assert dict(run_tasks(executor, hang_once, [(tmp_path / "marker", 7)])) == {0: 7}
     assert "they are stuck" in capfd.readouterr().err
 
@@ -354,7 +355,7 @@ def test_work_that_kills_every_worker_ends_in_an_error():
 
 def test_an_executor_that_never_answers_ends_in_an_error(tmp_path):
     with ThreadPoolExecutor(1) as executor, pytest.raises(TaskError, match="nothing was heard of the workers for 1 "):
-        list(run_tasks(executor, time.sleep, [(3,)], time_limit=1))
+        list(run_tasks(executor, time.sleep, [(1.5,)], time_limit=1))
 
 
 def test_a_worker_killed_in_mid_generation_costs_nothing_but_time(quick_run, tmp_path):
@@ -398,8 +399,8 @@ def test_an_environment_that_raises_stops_the_run_with_its_cause_and_the_run_goe
 
 def test_two_processes_do_not_share_a_run_folder(quick_run, tmp_path, capsys):
     folder = start_of("mdn_rnn", quick_run, tmp_path / "run")
-    holder = "import sys, time; from pathlib import Path; from stad_lab.checkpoints import locked\n"
-    holder += "with locked(Path(sys.argv[1])): print('held', flush=True); time.sleep(1000)"
+    holder = "import sys, time; from filelock import FileLock\n"  # as `locked` does, without its imports
+    holder += "with FileLock(sys.argv[1] + '/.lock'): print('held', flush=True); time.sleep(1000)"
     process = subprocess.Popen([sys.executable, "-c", holder, folder], stdout=subprocess.PIPE)
     assert process.stdout.readline() == b"held\n"
     before = snapshot(folder)
@@ -459,11 +460,16 @@ def test_a_read_only_folder_is_refused_before_any_work(small_disk, quick_run, ca
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")
 def test_a_file_too_large_for_the_quota_leaves_the_old_one(tmp_path):
-    script = "import resource, sys; from pathlib import Path; from stad_lab.checkpoints import write_bytes\n"
-    script += "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)); write_bytes(Path(sys.argv[1]), bytes(2000))"
+    import resource
+
     write_bytes(tmp_path / "file", b"old")
-    process = subprocess.run([sys.executable, "-c", script, tmp_path / "file"], capture_output=True, text=True)
-    assert "file could not be written (File too large)" in process.stderr
+    allowed = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, allowed[1]))
+    try:
+        with pytest.raises(OSError, match=r"file could not be written \(File too large\)"):
+            write_bytes(tmp_path / "file", bytes(2000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, allowed)
     assert (tmp_path / "file").read_bytes() == b"old"
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 

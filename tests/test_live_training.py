@@ -1,6 +1,7 @@
 """Training in a real kernel: the stop button ends a cell in one line, and the same cell goes on, bit for bit."""
 
 import os
+import shutil
 
 import pytest
 from jupyter_client.manager import start_new_kernel
@@ -8,7 +9,6 @@ from safetensors.torch import load_file
 
 from stad_lab import Settings
 from stad_lab.autoencoder import train_autoencoder
-from stad_lab.rollouts import collect_rollouts
 
 TRAIN = """
 from pathlib import Path
@@ -16,7 +16,7 @@ from stad_lab import Settings
 from stad_lab.autoencoder import train_autoencoder
 from stad_lab.plots import plot_history
 from stad_lab.widgets import watch_training
-settings = Settings.preset("quick", v_steps=60, processes=1)
+settings = Settings.preset("quick", v_steps=20)
 draw = lambda history: plot_history(history, f"step {history[-1]['step']}", "loss")
 folder = Path(FOLDER)
 train = lambda watch: train_autoencoder("frame", settings, folder.parent / "rollouts", folder, watch)
@@ -53,9 +53,9 @@ def run_cell(kernel, code, interrupt_after=None):
     return "".join(printed), figures, None if reply["status"] == "ok" else reply["ename"]
 
 
-def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(kernel, tmp_path):
-    settings = Settings.preset("quick", v_steps=60, processes=1)
-    collect_rollouts(settings, tmp_path / "rollouts")
+def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(kernel, quick_run, tmp_path):
+    settings = Settings.preset("quick", v_steps=20)
+    shutil.copytree(quick_run / "rollouts", tmp_path / "rollouts")
     stopped, straight = tmp_path / "stopped", tmp_path / "straight"
     for folder in (stopped, straight):
         folder.mkdir()

@@ -11,6 +11,7 @@ from PIL import Image
 
 from stad_lab import replication
 from stad_lab.__main__ import main
+from stad_lab.agent import drive
 from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import bootstrap, evaluate
 from stad_lab.evolution import LOG, fitness_curves
@@ -29,7 +30,7 @@ from stad_lab.table import (
     summarise_row,
 )
 
-TINY = {"processes": 1, "generations": 2, "v_steps": 8, "m_steps": 4}
+TINY = {"processes": 1, "generations": 2, "v_steps": 8, "m_steps": 4, "max_frames": 30}
 FIRST = Settings.preset("quick", **TINY)
 SECOND = Settings.preset("quick", **TINY | {"agent_episodes": 2, "generations": 4, "components": 8})
 
@@ -45,6 +46,7 @@ def table(tmp_path_factory):
         patch.setitem(ROWS, "one", Row("input", "one round", FIRST, seeds=(0,)))
         patch.setattr(replication, "TRACKS", 1)
         patch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
+        patch.setattr("stad_lab.evolution.drive", functools.partial(drive, max_frames=60))  # for evaluations alone
         folder = tmp_path_factory.mktemp("table")
         with ThreadPoolExecutor(1) as executor:
             yield folder, {name: replicate(name, folder, executor) for name in ("two", "blind")}
@@ -104,7 +106,8 @@ def test_what_is_there_is_not_done_again(table):
 def test_a_lost_evaluation_is_driven_again_to_the_same_numbers(table):
     folder, summaries = table
     (folder / "two" / "seed1" / "evaluation.json").unlink()
-    assert replicate("two", folder) == summaries["two"]
+    with ThreadPoolExecutor(1) as executor:
+        assert replicate("two", folder, executor) == summaries["two"]
 
 
 def test_an_evaluation_of_another_controller_is_driven_again(table):
@@ -112,7 +115,8 @@ def test_an_evaluation_of_another_controller_is_driven_again(table):
     path = folder / "two" / "seed1" / "evaluation.json"
     whole = load_json(path)
     save_json(path, whole | {"controller_sha256": "of an earlier one", "episodes": []})
-    assert replicate("two", folder) == summaries["two"]
+    with ThreadPoolExecutor(1) as executor:
+        assert replicate("two", folder, executor) == summaries["two"]
     assert load_json(path)["controller_sha256"] == whole["controller_sha256"]
 
 
@@ -210,7 +214,7 @@ def test_the_times_of_a_row_are_those_of_all_its_stages_in_both_rounds(table, tm
 
 
 def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long(monkeypatch):
-    monkeypatch.setitem(ROWS, "one", Row("input", "one round", Settings.preset("quick", v_batch=128, m_batch=64)))
+    monkeypatch.setitem(ROWS, "one", Row("input", "one round", Settings.preset("quick", width=4, v_batch=128)))
     times = forecast("one")
     assert all(times[part] > 0 for part in ("rollouts", "V", "M", "searches", "evaluations"))
     assert times["first search"] == 0 and times["evaluations"] > times["searches"]  # whole episodes against brief ones

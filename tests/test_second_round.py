@@ -5,6 +5,7 @@ import itertools
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -68,8 +69,9 @@ def test_a_collection_of_both_drivers_goes_on_where_it_stopped(second, quick_run
     assert load_json(folder / "manifest.json") == manifest
 
 
-def test_a_second_round_asks_for_the_room_that_its_two_kinds_of_episodes_may_take(quick_run, tmp_path):
-    settings = dataclasses.replace(SETTINGS, agent_episodes=1_000_000, max_frames=1000)  # 12 TB
+def test_a_second_round_asks_for_the_room_that_its_two_kinds_of_episodes_may_take(quick_run, tmp_path, monkeypatch):
+    settings = dataclasses.replace(SETTINGS, agent_episodes=1000, max_frames=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=0))
     with pytest.raises(OSError, match=r"up to \d+\.\d\d GB") as error:
         collect_again(VARIANT, settings, quick_run, tmp_path)
     asked = float(re.search(r"up to (\d+\.\d+) GB", str(error.value))[1])

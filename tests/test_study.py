@@ -87,7 +87,7 @@ def test_every_stride_and_weight_of_the_kl_is_trained_and_measured(quick_run, tm
     monkeypatch.setattr("stad_lab.study.VARIANTS", ("frame",))
     monkeypatch.setattr("stad_lab.study.STRIDES", (1, 4))
     monkeypatch.setattr("stad_lab.study.KL_WEIGHTS", (0.25, 4.0))
-    found = study(Settings.preset("quick"), quick_run / "rollouts", tmp_path, ["probe", "autoencoder"])
+    found = study(Settings.preset("quick", v_steps=4), quick_run / "rollouts", tmp_path, ["probe", "autoencoder"])
     for driver in ("random driver", "trained agent"):
         assert set(found["probe"]["variants"][driver]) == {"frame", "frame, untrained", "input_output, untrained"}
         assert set(found["probe"]["strides"][driver]) == {"1", "4"}
