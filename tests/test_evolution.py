@@ -5,16 +5,18 @@ import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
+import threading
 import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_limits
+import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
+from stad_lab import evolution
 from stad_lab.__main__ import main
 from stad_lab.agent import PRETRAINED, drive, load_controller
 from stad_lab.checkpoints import load_json, save_json
@@ -95,22 +97,29 @@ def test_fewer_generations_than_there_are_is_refused_before_anything_changes(one
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send to a process")
-def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, quick_run, tmp_path):
+def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, quick_run, tmp_path, capsys):
     folder = without_evolution(quick_run, tmp_path / "run")
-    command = [sys.executable, "-m", "stad_lab", "train", "--variant", "input_output", "--settings", "quick"]
-    command += ["--out", str(folder), "--set", f"generations={GENERATIONS}", "--set", "processes=1"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    deadline = time.time() + 120
-    while not (folder / "evolution.json").exists():
-        assert time.time() < deadline
-        time.sleep(0.005)
-    process.send_signal(signal.SIGINT)
-    error = process.communicate(timeout=60)[1]
-    assert process.returncode == 130
+    command = ["train", "--variant", "input_output", "--settings", "quick", "--out", str(folder)]
+    command += ["--set", f"generations={GENERATIONS}", "--set", "processes=1"]
+
+    def press_ctrl_c():
+        deadline = time.time() + 120
+        while not (folder / LOG).exists() and time.time() < deadline:
+            time.sleep(0.005)
+        signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with ThreadPoolExecutor(1) as finger:
+            finger.submit(press_ctrl_c)
+            assert main(command) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    error = capsys.readouterr().err
     assert "stopped; the same command goes on from the last checkpoint" in error
     assert "Traceback" not in error
     assert 1 <= len(read(folder)["generations"]) < GENERATIONS  # it was in the middle
-    assert main(command[3:]) == 0
+    assert main(command) == 0
     assert read(folder) == read(one_go)
     assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
 
@@ -279,40 +288,6 @@ def test_the_step_size_follows_its_plan_in_a_replay_too():
         replay(np.zeros(8), settings(sigma=0.3, sigma_decay=0.8), log)
 
 
-THREADS = """
-import sys
-from concurrent.futures import ThreadPoolExecutor
-import torch
-from threadpoolctl import threadpool_info
-from stad_lab import evolution
-from stad_lab.settings import Settings
-
-seen = {}
-
-def watch(name, threads):
-    real = getattr(evolution, name)
-
-    def watched(*given):
-        found = real(*given)
-        seen.setdefault(name, set()).add(threads())
-        return found
-
-    setattr(evolution, name, watched)
-
-loaded = [library["filepath"] for library in threadpool_info()]  # scipy's comes later, and the search does not use it
-
-def of_numpy():
-    return max(library["num_threads"] for library in threadpool_info() if library["filepath"] in loaded)
-
-before = of_numpy(), torch.get_num_threads()
-watch("ask", of_numpy)
-watch("drive_group", torch.get_num_threads)
-with ThreadPoolExecutor(1) as executor:
-    evolution.evolve("input_output", Settings.preset("quick", generations=2), sys.argv[1], executor)
-print(before, seen["ask"], seen["drive_group"])
-"""
-
-
 def test_from_300_parameters_on_two_agents_stand_ahead_of_the_mean_and_behind_it_to_find_the_step_size():
     quick, random = settings(population=8, sigma_decay=0.0), np.random.default_rng(0)
     for parameters in (299, 300):
@@ -346,17 +321,32 @@ def test_the_shape_stays_round_in_the_long_run_of_notebook_04_as_with_scores_dra
         assert strategy.sp.c1 + strategy.sp.cmu == pytest.approx(0.000011, abs=5e-7)
 
 
-def test_a_search_runs_on_one_thread_wherever_more_are_to_be_had(quick_run, tmp_path):
-    folder = without_evolution(quick_run, tmp_path / "run")
-    process = subprocess.run(
-        [sys.executable, "-c", THREADS, folder],
-        env=os.environ | {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    more = 2 if os.cpu_count() > 1 else 1
-    assert process.stdout == f"({more}, {more}) {{1}} {{1}}\n"
+def test_a_search_runs_on_one_thread_wherever_more_are_to_be_had(quick_run, tmp_path, monkeypatch):
+    folder, seen, more = without_evolution(quick_run, tmp_path / "run"), {}, 2 if os.cpu_count() > 1 else 1
+
+    def of_numpy():
+        return max(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+
+    def watch(name, threads):
+        real = getattr(evolution, name)
+
+        def watched(*given):
+            found = real(*given)
+            seen.setdefault(name, set()).add(threads())
+            return found
+
+        monkeypatch.setattr(evolution, name, watched)
+
+    watch("ask", of_numpy)
+    watch("drive_group", torch.get_num_threads)
+    torch.set_num_threads(more)
+    try:
+        with threadpool_limits(more), ThreadPoolExecutor(1) as executor:
+            before = of_numpy(), torch.get_num_threads()
+            evolve("input_output", settings(generations=2, max_frames=20), folder, executor)
+    finally:
+        torch.set_num_threads(1)
+    assert before == (more, more) and seen == {"ask": {1}, "drive_group": {1}}
 
 
 def test_a_replay_comes_to_the_logged_means_with_any_number_of_threads():

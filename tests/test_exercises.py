@@ -11,8 +11,6 @@ from pathlib import Path
 import nbformat
 import pytest
 from nbclient import NotebookClient
-from nbgrader.api import Gradebook
-from nbgrader.utils import determine_grade
 
 COURSE = Path(__file__).parent.parent / "notebooks" / "exercises"
 NAMES = sorted(folder.name for folder in (COURSE / "source").iterdir())
@@ -59,9 +57,16 @@ def graded(request, generator, tmp_path_factory):
     return root, name
 
 
+def open_gradebook(root):
+    """nbgrader's book of the marks of a course."""
+    from nbgrader.api import Gradebook  # takes seconds: every process of the tests reads this file, one needs it
+
+    return Gradebook(f"sqlite:///{root / 'gradebook.db'}")
+
+
 def scores(root, name, student):
     """The marks of an assignment: cell -> nbgrader's grade."""
-    with Gradebook(f"sqlite:///{root / 'gradebook.db'}") as gradebook:
+    with open_gradebook(root) as gradebook:
         submission = gradebook.find_submission_notebook(name, name, student)
         return {grade.name: (grade.auto_score, grade.max_score_gradecell) for grade in submission.grades}
 
@@ -83,7 +88,7 @@ def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(graded
     points = {grading(cell)["grade_id"]: grading(cell) for cell in read_cells(SOURCES[name]) if grading(cell)["grade"]}
     machine = sum(cell["points"] for cell in points.values() if not cell["solution"])
     read_by_hand = next(grade_id for grade_id, cell in points.items() if cell["solution"])
-    with Gradebook(f"sqlite:///{root / 'gradebook.db'}") as gradebook:
+    with open_gradebook(root) as gradebook:
         gradebook.find_grade(read_by_hand, name, name, "stub").manual_score = 1.5
         gradebook.db.commit()
     monkeypatch.chdir(root)
@@ -94,6 +99,8 @@ def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(graded
 
 
 def test_a_warning_or_a_progress_bar_under_a_check_costs_no_points():
+    from nbgrader.utils import determine_grade
+
     lines = [
         re.findall(r"^sys\.stderr = .*$", cell["source"], re.M)
         for path in SOURCES.values()

@@ -1,5 +1,6 @@
 """Workers: where they come from, and memory that is kept for the next step, but not without bound."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from stad_lab.evaluation import evaluate
 from stad_lab.parallel import WorkerProcesses, has_glibc, peak_memory, run_tasks, worker_processes
 
 FREED = """
@@ -50,20 +52,19 @@ def test_the_workers_of_all_pools_come_from_one_process_that_has_imported_the_li
     assert "worker" not in peak_memory()
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        "stad_lab.pipeline.train('input', Settings.preset('quick'), 'run')",
-        "stad_lab.evaluation.evaluate('input', episodes=2, first_track=100, fast=True)",
-    ],
-)
-def test_a_script_that_its_workers_read_again_learns_the_remedy(call, tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(f"import stad_lab.evaluation, stad_lab.pipeline\nfrom stad_lab import Settings\n{call}\n")
+def test_a_script_that_its_workers_read_again_learns_the_remedy(tmp_path):
+    script, call = tmp_path / "script.py", "train('input', Settings.preset('quick'), 'run')"
+    script.write_text(f"from stad_lab import Settings\nfrom stad_lab.pipeline import train\n{call}\n")
     command = [sys.executable, "-W", "ignore", script]
     process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert process.returncode != 0
     assert 'below a line `if __name__ == "__main__":`' in process.stderr and "in use by another" not in process.stderr
+
+
+def test_whoever_evaluates_in_a_worker_that_is_just_starting_learns_the_remedy(monkeypatch):
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(RuntimeError, match="below a line `if __name__"):
+        evaluate("input", episodes=2, first_track=100, fast=True)
 
 
 def test_on_windows_there_are_as_many_processes_as_it_can_wait_for(monkeypatch):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -184,7 +185,11 @@ def test_every_v_is_probed_with_its_own_stride(monkeypatch, tmp_path):
     assert asked == [(f"V of stride {stride}", stride) for stride in STRIDES]
 
 
-def test_the_command_probes_v_and_m_of_a_run_and_keeps_every_r2_with_its_interval(quick_run, tmp_path, capsys):
+def test_the_command_probes_v_and_m_of_a_run_and_keeps_every_r2_with_its_interval(
+    quick_run, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr("stad_lab.study.AGENT_FRAMES", 120)  # in the workers, too: they are threads
+    monkeypatch.setattr("stad_lab.study.worker_processes", lambda count: ThreadPoolExecutor(1))
     file, before = tmp_path / "probe.json", sorted(quick_run.iterdir())
     arguments = ["--variant", "input_output", "--path", quick_run, "--drives", "12", "--json", file]
     assert main(["probe", *map(str, arguments)]) == 0
