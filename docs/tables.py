@@ -111,7 +111,7 @@ def up_to_date(rows: dict[str, list[Path]], label: str) -> dict[Path, str]:
     page = put_table(page, answer_table(rows))
     page = re.sub(r"!\[[^]]*\]\((notebooks/pictures/claims.png)\)", rf"![{label}](\1)", page)
     missing = ", ".join(f"`{name}`" for name in ROWS if name not in rows)
-    page = re.sub(r"Not made yet: [^.]*\.", f"Not made yet: {missing}.", page)
+    page = re.sub(r"Not made yet: [^.]*\.", f"Not made yet: {missing or 'none'}.", page)
     pages = {readme: page, results: results.read_text(encoding="utf-8")}
     for table in (spread_table(rows), variants_table(rows), changes_table(rows)):
         pages[results] = put_table(pages[results], table)

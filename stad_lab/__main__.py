@@ -13,12 +13,11 @@ from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-from stad_lab.environment import check_environment, escape_foreign_letters
+from stad_lab.environment import escape_foreign_letters, tell_environment
 
 if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports that a broken installation would fail
     escape_foreign_letters()
-    print(report := check_environment())
-    sys.exit(0 if report.ok else 1)
+    sys.exit(tell_environment())
 
 from stad_lab.agent import load_agent, load_world_model, run_folder
 from stad_lab.autoencoder import VARIANTS, check_variant
@@ -28,7 +27,7 @@ from stad_lab.evaluation import describe, evaluate
 from stad_lab.finish import FINISH, OPEN, finish, finish_settings
 from stad_lab.parallel import TaskError
 from stad_lab.pipeline import STAGES, ship, train
-from stad_lab.replication import describe_forecast, describe_row, forecast, keep, replicate
+from stad_lab.replication import describe_row, describe_time, keep, replicate, time_needed
 from stad_lab.rows import FLOORS, ROWS
 from stad_lab.settings import PRESETS, Settings
 from stad_lab.study import PARTS as STUDY_PARTS
@@ -159,13 +158,7 @@ def drivers(scheduler: str | None) -> Iterator[Executor | None]:
 def add_check(commands: argparse._SubParsersAction) -> None:
     """The command check."""
     command = commands.add_parser("check", help="is everything installed, and what to do about what is not")
-    command.set_defaults(do=do_check)
-
-
-def do_check(options: argparse.Namespace) -> int:
-    """Say whether everything that stad_lab needs is here."""
-    print(report := check_environment())
-    return 0 if report.ok else 1
+    command.set_defaults(do=lambda _: tell_environment())
 
 
 def add_train(commands: argparse._SubParsersAction) -> None:
@@ -323,7 +316,7 @@ def do_replicate(options: argparse.Namespace) -> None:
         print("\n".join(f"kept in {folder}" for folder in kept) or "no seed is finished")
         return
     with drivers(options.scheduler) as executor:
-        print(describe_forecast(options.row, forecast(options.row, options.seeds)), flush=True)
+        print(describe_time(options.row, time_needed(options.row, options.seeds)), flush=True)
         print(describe_row(options.row, replicate(options.row, options.out, executor, options.seeds)))
 
 

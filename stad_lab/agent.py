@@ -17,7 +17,7 @@ from stad_lab.car_racing import MAX_FRAMES, make_env
 from stad_lab.checkpoints import load_tensors, save_tensors
 from stad_lab.controller import check_parameters, control, parameter_count
 from stad_lab.frames import FrameMemory, to_frame
-from stad_lab.mdn_rnn import MDNRNN, check_partner, load_mdn_rnn
+from stad_lab.mdn_rnn import MDNRNN, State, check_partner, load_mdn_rnn
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 CONTROLLER = "controller.safetensors"  # the file of C
@@ -29,6 +29,8 @@ class Agent:
     Attributes:
         latents: z of the last frame, float32 (cars, latent_size); None before the first.
         hidden: M's memory h that C saw with it, float32 (cars, hidden_size).
+        state: M's memory (h, c) after the last action, float32 (1, cars, hidden_size) each; None before the first.
+        cars: which cars of the first step still drive, int (cars,); None before the first.
 
     Args:
         parameters: of C, (parameters,) or one row for each car (cars, parameters).
@@ -48,8 +50,8 @@ class Agent:
     def reset(self) -> None:
         """Forget the past: every episode begins with this."""
         self.memory = FrameMemory(self.stride)
-        self.cars: np.ndarray | None = None  # which of the cars of the first step still drive
-        self.state: tuple[torch.Tensor, torch.Tensor] | None = None
+        self.cars: np.ndarray | None = None
+        self.state: State | None = None
         self.latents: np.ndarray | None = None
         self.hidden: np.ndarray | None = None
 
@@ -82,7 +84,7 @@ class Agent:
         return actions
 
     @torch.inference_mode()
-    def take_in(self, actions: np.ndarray, before: tuple[torch.Tensor, torch.Tensor] | None) -> None:
+    def take_in(self, actions: np.ndarray, before: State | None) -> None:
         """Let M remember the last z with these actions, float32 (cars, 3).
 
         `act` does it with its own. Whoever drives otherwise calls it again, with what was done in truth.

@@ -312,7 +312,7 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     _, lengths = drive(crowd, list(range(cars)), max_frames=frames)
     whole = (time.perf_counter() - begin) / lengths.sum()
 
-    env, blind = make_env(bar=False), make_blind_env()
+    env, blind = make_env(bar=not agent.crop_bar), make_blind_env()
     observation = env.reset(seed=0)[0]
     actions = []
     for _ in range(frames):
@@ -327,7 +327,7 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     memory, observations = FrameMemory(agent.stride), [observation] * cars
 
     def prepare():
-        seen = np.stack([to_frame(observation) for observation in observations])
+        seen = np.stack([to_frame(observation, agent.crop_bar) for observation in observations])
         return to_pictures(seen, memory.push(seen))
 
     with torch.inference_mode():

@@ -225,7 +225,7 @@ def load_into(module: torch.nn.Module, tensors: dict[str, torch.Tensor], path: P
         ValueError: names or shapes that differ, or weights that are not finite.
     """
     expected = module.state_dict()
-    for name in expected.keys() | tensors.keys():
+    for name in sorted(expected.keys() | tensors.keys()):
         if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape:
             found = tuple(tensors[name].shape) if name in tensors else "nothing"
             wanted = tuple(expected[name].shape) if name in expected else "nothing"

@@ -17,7 +17,8 @@ from distributed.comm import get_address_host_port, parse_address
 from stad_lab.parallel import task_errors
 
 PATIENCE = 60.0  # seconds to wait for a scheduler to answer and for its first worker
-SAME = ("stad_lab", "torch", "numpy", "gymnasium", "box2d", "opencv-python-headless")  # or the numbers would differ
+# Versions that differ would give other numbers.
+SAME = ("stad_lab", "torch", "numpy", "gymnasium", "box2d", "pygame-ce", "opencv-python-headless")
 
 
 class ClusterExecutor(ClientExecutor):

@@ -78,7 +78,8 @@ class DreamEnv(gym.Env):
             latents = self.np_random.standard_normal(size)
         latents = np.asarray(latents, np.float32)
         if latents.shape != (size,) or not np.isfinite(latents).all():
-            raise ValueError(f"latents of shape {latents.shape}: expected ({size},) finite numbers, V's z")
+            finite = f"{np.isfinite(latents).sum()} of them finite"
+            raise ValueError(f"latents of shape {latents.shape}, {finite}: expected ({size},) finite numbers, V's z")
         self.latents = torch.from_numpy(latents.copy())
         zeros = torch.zeros(1, 1, self.mdn_rnn.hidden_size)
         self.state: State = options.get("state") or (zeros, zeros.clone())

@@ -99,6 +99,12 @@ def check_environment(folder: str | Path = ".") -> Report:
     return Report((*lines, *attempt(check_folder, Path(folder))))
 
 
+def tell_environment() -> int:
+    """Print what `check_environment` finds; returns what the command ends with, 0 if all is well."""
+    print(report := check_environment())
+    return 0 if report.ok else 1
+
+
 def escape_foreign_letters() -> None:
     """From now on print letters that the console does not have, of a folder's name for example, as escapes."""
     if hasattr(sys.stdout, "reconfigure"):

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from tqdm.auto import tqdm
 
-from stad_lab.agent import load_agent, run_folder
+from stad_lab.agent import CONTROLLER, load_agent, run_folder
 from stad_lab.checkpoints import checksum, load_json, save_json
-from stad_lab.evolution import CONTROLLER, drive_group, hand_out
+from stad_lab.evolution import drive_group, hand_out
 from stad_lab.parallel import run_tasks, worker_processes
 from stad_lab.rollouts import TRACK_RANGES
 

@@ -110,12 +110,14 @@ def run_generation(
 ) -> dict:
     """Ask for a population, let it drive, and tell its fitness; adds to the means, returns the log's entry.
 
+    The means, before and after, are float64 (searched,) each.
+
     Its "sigma" is the step size that CMA-ES would take next, which `settings.sigma_decay` overrules (see `ask`).
     """
     population = ask(strategy, settings, len(earlier))
     entry = drive_generation(executor, source, variant, settings, earlier, space.expand(population))
     tell(strategy, population, entry["returns"], means)
-    entry |= {"sigma": float(strategy.sigma), "mean_checksum": mean_checksum(strategy.mean)}
+    entry |= {"sigma": float(strategy.sigma), "mean_checksum": vector_checksum(strategy.mean)}
     if entry["generation"] % settings.validate_every == 0:
         controller = space.expand(averaged_mean(means, settings))
         entry["validation"] = validate(executor, source, variant, settings, controller)
@@ -148,7 +150,7 @@ def check_space(
     last = max((number for number, entry in enumerate(generations, 1) if "validation" in entry), default=0)
     if not last:
         return
-    found = mean_checksum(space.expand(averaged_mean(means[:last], settings)))
+    found = vector_checksum(space.expand(averaged_mean(means[:last], settings)))
     if found != generations[last - 1]["validation"]["controller_checksum"]:
         raise ValueError(
             f"{folder} holds other components, or another start, than the search in {folder / LOG} had: put the"
@@ -158,6 +160,8 @@ def check_space(
 
 def averaged_mean(means: list[np.ndarray], settings: Settings) -> np.ndarray:
     """The average of the last `averaged_share` of the means, of one at least: the controller that a search has found.
+
+    The means and their average are float64 (searched,).
 
     The noise of the returns drives the mean about; what several means have in common is what was learned (Polyak's
     averaging).
@@ -202,7 +206,7 @@ def kept_generation(variant: str, folder: Path, log: dict) -> int | None:
         if "validation" in entry
     }
     generation = facts.get("generation")
-    if mean_checksum(parameters) != validated.get(generation):
+    if vector_checksum(parameters) != validated.get(generation):
         raise ValueError(
             f"{path} does not come from the run that {folder / LOG} tells of: move it away, and the same command makes"
             " the right one"
@@ -220,12 +224,12 @@ def note_best(log: dict) -> bool:
 
 
 def keep_controller(variant: str, folder: Path, log: dict, controller: np.ndarray, world_model: WorldModel) -> None:
-    """Write C, with what it has to do with the log and with V and M."""
+    """Write C, float64 (parameters,), with what it has to do with the log and with V and M."""
     save_controller(folder / CONTROLLER, controller, variant=variant, **log["best"], **world_model.identities)
 
 
 def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStrategy":
-    """pycma's strategy with a Generator of its own, so that nothing else can disturb it.
+    """pycma's strategy from `start`, float64 (searched,), with a Generator of its own: nothing else can disturb it.
 
     Below 300 parameters pycma adapts the step size by the length of the mean's path. From there on it sets two agents
     of a generation on the line of the mean's last move, one ahead of the mean and one behind it, and lengthens the step
@@ -277,7 +281,7 @@ def replay(
     for number, entry in enumerate(generations):
         population = ask(strategy, settings, number)
         tell(strategy, population, entry["returns"], means)
-        if mean_checksum(strategy.mean) != entry["mean_checksum"]:
+        if vector_checksum(strategy.mean) != entry["mean_checksum"]:
             raise ValueError(
                 f"replaying the log gives another mean in generation {number + 1} than the run had: the log was"
                 " changed, or made on another machine or by other versions of cma and numpy. Start in a new folder"
@@ -285,9 +289,9 @@ def replay(
     return strategy, means
 
 
-def mean_checksum(mean: np.ndarray) -> int:
-    """CRC-32 of the mean's bytes: two strategies that agree in it agree to the last bit."""
-    return zlib.crc32(np.ascontiguousarray(mean).tobytes())
+def vector_checksum(vector: np.ndarray) -> int:
+    """CRC-32 of the bytes of CMA-ES's mean or of a C, float64: two that agree in it agree to the last bit."""
+    return zlib.crc32(np.ascontiguousarray(vector).tobytes())
 
 
 def hand_out(executor: Executor, folder: Path, variant: str) -> Any:
@@ -342,7 +346,10 @@ def drive_generation(
 
 
 def validate(executor: Executor, source: Any, variant: str, settings: Settings, controller: np.ndarray) -> dict:
-    """Drive a controller on the validation tracks: its mean return, all returns, the frames, and which one it was."""
+    """Drive a controller, float64 (parameters,), on the validation tracks.
+
+    Returns its mean return, all returns, the frames, and which one it was.
+    """
     tracks = track_seeds("validate", settings.validation_tracks)  # the same ones for every seed
     copies = np.repeat(controller[None], len(tracks), axis=0)
     patient = dataclasses.replace(settings, patience=0)  # nobody is given up on, as in the final evaluation
@@ -351,7 +358,7 @@ def validate(executor: Executor, source: Any, variant: str, settings: Settings, 
         "mean": float(returns.mean()),
         "returns": returns.tolist(),
         "frames": int(lengths.sum()),
-        "controller_checksum": mean_checksum(controller),
+        "controller_checksum": vector_checksum(controller),
     }
 
 

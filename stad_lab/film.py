@@ -11,34 +11,34 @@ from stad_lab.drives import FRAMES_A_SECOND, Drive, Inside, look_inside, record_
 from stad_lab.frames import earlier_frames
 from stad_lab.plots import check_kind, difference_colors, moving_figure, moving_picture, plot_moment
 
+EVERY = 3  # of so many frames one is shown; a film runs at the real speed
 NAP = 100  # frames of a dream, two seconds: long enough to see it leave the drive, short enough to compare
 
 
 @torch.no_grad()
-def film_agent(agent: Agent, track: int, first: int, frames: int, every: int = 3) -> bytes:
+def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
     """An animated GIF of observation, difference image, reconstruction and dream while the agent drives.
 
     Args:
         track: seed of the track.
         first: first frame to show.
         frames: number of frames to cover.
-        every: show one frame in so many; the film runs at the real speed, 50 frames a second.
 
     Raises:
         ValueError: the episode ends before `first`, or a number that is out of range.
     """
-    drive = record_longer_drive(agent, track, first, frames, every)
+    drive = record_longer_drive(agent, track, first, frames)
     film = drive.frames(agent.crop_bar)
     earlier = earlier_frames(film, agent.stride)
-    shown = slice(first, None, every)
+    shown = slice(first, None, EVERY)
     frame, difference = to_pictures(film[shown], earlier[shown])
     columns = {
         "what the car shows": drive.observations[shown],
         "what changes": difference_colors(to_array(difference)),
         "what V makes of it": to_uint8(agent.autoencoder.reconstruct(frame, difference)[0]),
-        "what it dreams": naps(agent, drive, first)[::every],
+        "what it dreams": naps(agent, drive, first)[::EVERY],
     }
-    return moving_picture(columns, fps=FRAMES_A_SECOND / every)
+    return moving_picture(columns, fps=FRAMES_A_SECOND / EVERY)
 
 
 def naps(agent: Agent, drive: Drive, first: int, length: int = NAP) -> np.ndarray:
@@ -57,7 +57,7 @@ def naps(agent: Agent, drive: Drive, first: int, length: int = NAP) -> np.ndarra
     return np.concatenate(dreams)
 
 
-def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 3, kind: str = "gif") -> bytes:
+def film_viewer(agent: Agent, track: int, first: int, frames: int, kind: str = "gif") -> bytes:
     """The rollout viewer while the agent drives, as an animation; arguments as for `film_agent`.
 
     Args:
@@ -67,20 +67,20 @@ def film_viewer(agent: Agent, track: int, first: int, frames: int, every: int = 
         ValueError: as `film_agent`, or another kind.
     """
     check_kind(kind)
-    drive = record_longer_drive(agent, track, first, frames, every)
+    drive = record_longer_drive(agent, track, first, frames)
     inside = look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
-    return film_inside(drive, inside, first, every, kind)
+    return film_inside(drive, inside, first, kind)
 
 
-def film_inside(drive: Drive, inside: Inside, first: int = 0, every: int = 3, kind: str = "gif") -> bytes:
-    """The rollout viewer as an animation, "gif" or "webp": one moment in `every`, at the real speed."""
-    moments = tqdm(range(first, len(drive), every), "film", unit="picture")
-    return moving_figure((plot_moment(drive, inside, moment) for moment in moments), FRAMES_A_SECOND / every, kind)
+def film_inside(drive: Drive, inside: Inside, first: int = 0, kind: str = "gif") -> bytes:
+    """The rollout viewer as an animation, "gif" or "webp": one moment in EVERY, at the real speed."""
+    moments = tqdm(range(first, len(drive), EVERY), "film", unit="picture")
+    return moving_figure((plot_moment(drive, inside, moment) for moment in moments), FRAMES_A_SECOND / EVERY, kind)
 
 
-def record_longer_drive(agent: Agent, track: int, first: int, frames: int, every: int) -> Drive:
+def record_longer_drive(agent: Agent, track: int, first: int, frames: int) -> Drive:
     """Record a drive of at most `first + frames` frames; raises as `film_agent`, before the drive where it can."""
-    for name, value, least in (("track", track, 0), ("first", first, 0), ("frames", frames, 1), ("every", every, 1)):
+    for name, value, least in (("track", track, 0), ("first", first, 0), ("frames", frames, 1)):
         if value < least:
             raise ValueError(f"{name}={value}: expected at least {least}")
     drive = record_drive(agent, track, first + frames)

@@ -12,10 +12,10 @@ a new track in a generation of this number, it is the first of the new ones here
 from concurrent.futures import Executor
 from pathlib import Path
 
-from stad_lab.agent import load_agent, load_controller, read_world_model
+from stad_lab.agent import CONTROLLER, load_agent, load_controller, read_world_model
 from stad_lab.autoencoder import check_variant
 from stad_lab.checkpoints import copy_file, load_json, locked
-from stad_lab.evolution import CONTROLLER, evolve
+from stad_lab.evolution import evolve
 from stad_lab.mdn_rnn import check_partner
 from stad_lab.parallel import refuse_in_starting_worker
 from stad_lab.pipeline import GIVE_A_RUN, open_record, read_finished, run_stages, set_options

@@ -162,10 +162,14 @@ def sequence_batch(
         mu, logvar = encoded[index]
         start = rng.integers(len(mu) - length)
         stretch = slice(start, start + length + 1)
-        noise = rng.standard_normal((length + 1, mu.shape[1]), np.float32)
-        latents.append(mu[stretch] + np.exp(0.5 * logvar[stretch]) * noise)
+        latents.append(sample_latents(mu[stretch], logvar[stretch], rng))
         chosen_actions.append(actions[index][start : start + length])
     return torch.from_numpy(np.stack(latents)), torch.from_numpy(np.stack(chosen_actions))
+
+
+def sample_latents(mu: np.ndarray, logvar: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Draw z from N(mu, exp(logvar)), float32 of their common shape."""
+    return mu + np.exp(0.5 * logvar) * rng.standard_normal(mu.shape, np.float32)
 
 
 def long_episodes(lengths: list[int], length: int, which: str = "") -> list[int]:

@@ -11,8 +11,8 @@ The folder of a run::
     start.safetensors             only in a second round or a finish: the earlier run's C, for the V and M here
     record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
                                   stage, and the most memory that a process has held by its end (in MB, for each start);
-                                  of a start that was killed, or that a full disk or a refused file has ended, its
-                                  time and that it was are missing
+                                  a start that was killed, or that a full disk or a refused file ended, leaves no
+                                  trace in it
 """
 
 import importlib.metadata

@@ -94,6 +94,7 @@ class Session:
         world: "real" or "dream"; change it with `enter`.
         driver: "hand" or "agent"; change it with `give`.
         hand: whose `held` keys drive while the driver is "hand".
+        dream: the DreamEnv that is driven in the dream; its `temperature` may be set.
         track: seed of the present track.
         score: return of the real episode so far.
         earlier: the last four episodes before this one, as (track, Drive), newest last.

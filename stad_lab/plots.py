@@ -449,18 +449,16 @@ def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
     return figure
 
 
-def plot_search(
-    landscape: Callable[[np.ndarray], np.ndarray], generations: list[dict], shown: list[int], reach: float = 4.0
-) -> Figure:
+def plot_search(landscape: Callable[[np.ndarray], np.ndarray], generations: list[dict], shown: list[int]) -> Figure:
     """CMA-ES on a function of two variables: the population and the one-sigma ellipse of some generations.
 
     Args:
         landscape: function of an array (..., 2), to be minimised.
         generations: each {"population" (n, 2), "mean" (2,), "covariance" (2, 2)}, the covariance with sigma squared.
         shown: indices of the generations to draw, one panel each.
-        reach: the panels show [-reach, reach] in both variables.
     """
     figure, axes = new_figure(2.5 * len(shown) + 0.5, 3.5, 1, len(shown), sharex=True, sharey=True)
+    reach = 4.0  # the panels show [-reach, reach] in both variables
     x = np.linspace(-reach, reach, 121)
     height = landscape(np.stack(np.meshgrid(x, x), axis=-1))
     for index, axis in zip(shown, axes[0], strict=True):
@@ -588,13 +586,12 @@ def difference_colors(difference: np.ndarray) -> np.ndarray:
     return (colormaps[DIFFERENCE_MAP](shade)[..., :3] * 255).round().astype(np.uint8)
 
 
-def moving_picture(columns: dict[str, np.ndarray], fps: float = 25, size: int = 192) -> bytes:
+def moving_picture(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
     """An animated GIF of films side by side.
 
     Args:
         columns: title -> film, uint8 (frames, H, W, 3), square; all of one length.
         fps: pictures per second.
-        size: width and height of each film in the GIF, pixels.
 
     Raises:
         ValueError: no films, or films of different lengths.
@@ -602,7 +599,7 @@ def moving_picture(columns: dict[str, np.ndarray], fps: float = 25, size: int = 
     lengths = {title: len(film) for title, film in columns.items()}
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
         raise ValueError(f"films of lengths {lengths}: expected films of one length, at least one frame")
-    header, gap = 20, 6
+    size, header, gap = 192, 20, 6  # pixels
     font = ImageFont.load_default(13)
     pages = []
     for pictures in zip(*columns.values(), strict=True):

@@ -85,10 +85,14 @@ def check_rows(features: np.ndarray, targets: np.ndarray, drives: np.ndarray) ->
         raise ValueError(
             f"{len(features)} rows of features, {len(targets)} of targets, {len(drives)} of drives: unequal"
         )
-    if not (np.isfinite(features).all() and np.isfinite(targets).all()):
-        raise ValueError("features or targets that are not finite: leave those rows out")
-    if not np.ptp(targets, axis=0).all():
-        raise ValueError("a target has one value throughout: there is nothing that a probe could tell, leave it out")
+    finite = np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
+    if not finite.all():
+        raise ValueError(f"{(~finite).sum()} rows of features or targets that are not finite: leave those rows out")
+    constant = np.flatnonzero(np.ptp(targets, axis=0) == 0).tolist()
+    if constant:
+        raise ValueError(
+            f"targets {constant} have one value throughout: a probe can tell nothing of them, leave them out"
+        )
     count = len(np.unique(drives))
     if count < 10:
         raise ValueError(f"{count} drives: expected at least 10, to fit on some and to measure on the others")

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from stad_lab.autoencoder import AutoEncoder, kl_divergence, to_array, to_pictures
+from stad_lab.frames import difference_image
 from stad_lab.mdn_rnn import MDNRNN, Mixture, log_likelihood, sample_mixture
 
 ACTIVE = 0.05  # nats; a latent that tells less on average is called inactive
@@ -74,7 +75,7 @@ def autoencoder_quality(autoencoder: AutoEncoder, frames: np.ndarray, earlier: n
     redrawn = redraw(autoencoder, frames, earlier)
     true = frames / np.float32(255)
     error = ((redrawn.frames - true) ** 2).sum(axis=-1)
-    difference = true - earlier / np.float32(255)
+    difference = difference_image(frames, earlier)
     regions = {}
     for name, mask in region_masks(frames).items():
         flat = ((true[mask] - true[mask].mean(axis=0, dtype=np.float64)) ** 2).sum(axis=-1).mean()

@@ -22,13 +22,14 @@ from pathlib import Path
 
 import numpy as np
 
+from stad_lab.agent import CONTROLLER
 from stad_lab.autoencoder import AutoEncoder
 from stad_lab.benchmark import save_pair, train_m, train_v
 from stad_lab.car_racing import MAX_FRAMES, make_env
 from stad_lab.checkpoints import checksum, copy_file, load_json, load_tensors, save_json
 from stad_lab.controller import initial_parameters, squash
 from stad_lab.evaluation import SOLVED, evaluate, report
-from stad_lab.evolution import CONTROLLER, LOG, drive_generation
+from stad_lab.evolution import LOG, drive_generation
 from stad_lab.finish import finish
 from stad_lab.mdn_rnn import MDNRNN
 from stad_lab.parallel import run_in_order, work_alone, worker_processes
@@ -99,10 +100,8 @@ def drive_blindly(name: str, track: int) -> tuple[float, int]:
     Rewards do not depend on the renderer, so the fast one serves.
     """
     work_alone()
-    driver, gentle = (
-        RandomDriver(np.random.default_rng([0, track])),
-        squash(np.array([0.0, Settings().initial_gas, 0.0])),
-    )
+    driver = RandomDriver(np.random.default_rng([0, track]))
+    gentle = squash(np.array([0.0, Settings().initial_gas, 0.0]))
     env = make_env(fast=True)
     env.reset(seed=track)
     total, frames, ended = 0.0, 0, False
@@ -211,7 +210,7 @@ def copy_records(source: Path, target: Path) -> None:
             copy_file(source / file, target)
 
 
-def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
+def time_needed(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
     """How long a row, or some of its seeds, takes on this machine, in seconds: what it is for -> time.
 
     Measures for about half a minute.
@@ -222,7 +221,7 @@ def forecast(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
         return {"evaluations": TRACKS * MAX_FRAMES / (Settings().processes * blind_speed(name))}
     row = find_row(name, seeds)
     if row.base:
-        times, before = forecast(row.base, row.seeds), ROWS[row.base].settings
+        times, before = time_needed(row.base, row.seeds), ROWS[row.base].settings
         longer = most_frames(row.settings) / most_frames(before)
         return times | {"finishes": times["searches"] * longer, "evaluations": 2 * times["evaluations"]}
     with tempfile.TemporaryDirectory() as folder:
@@ -281,7 +280,7 @@ def blind_speed(name: str) -> float:
     return drive_blindly(name, 0)[1] / (time.perf_counter() - begin)
 
 
-def describe_forecast(name: str, times: dict[str, float]) -> str:
+def describe_time(name: str, times: dict[str, float]) -> str:
     """One line that says how long a row takes."""
     parts = ", ".join(f"{part} {seconds / 60:.0f} min" for part, seconds in times.items() if seconds)
     return (

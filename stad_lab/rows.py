@@ -16,7 +16,7 @@ FLOORS = {  # rows of drivers that do not look at the road
     "gentle_driver": "straight on with little gas, as the first agent that evolution tries",
 }
 EARLY = (0, 1, 2, 3, 4)  # seeds of the rows whose runs are short, and whose scores scatter the most
-AGAIN = (0, 1)  # seeds of the rows without the bar
+NO_BAR_SEEDS = (0, 1)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def make_rows() -> dict[str, Row]:
         settings, world = dataclasses.replace(one, **changes), "one_round" if shares else None
         rows[name] = Row("input", about, settings, seeds=(0,), world=world)
     # What counts there is the luck of V, so each seed has its own.
-    rows["no_bar"] = dataclasses.replace(rows["no_bar"], seeds=AGAIN, retrained=True)
+    rows["no_bar"] = dataclasses.replace(rows["no_bar"], seeds=NO_BAR_SEEDS, retrained=True)
     for variant, what in NO_BAR.items():
         about = f"{rows['no_bar'].about}, {what}"
         rows[f"no_bar_{variant}"] = dataclasses.replace(rows["no_bar"], variant=variant, about=about)

@@ -18,15 +18,15 @@ from tqdm.auto import tqdm
 from stad_lab.agent import WorldModel, read_world_model
 from stad_lab.autoencoder import check_part
 from stad_lab.checkpoints import load_tensors, save_tensors
-from stad_lab.controller import ACTION_SIZE, check_parameters, initial_parameters, parameter_count, seen_columns
+from stad_lab.controller import check_parameters, initial_parameters, parameter_count, seen_columns
 from stad_lab.drives import remember_drive
-from stad_lab.mdn_rnn import check_partner, encode_frames
+from stad_lab.mdn_rnn import ACTION_SIZE, check_partner, encode_frames
 from stad_lab.rollouts import Rollouts
 from stad_lab.settings import Settings
 
 START = "start.safetensors"
 COMPONENTS = "components.safetensors"
-MAKE_AGAIN = "run the same command again, which makes it again"
+MAKE_AGAIN = "run the command that made this run again, which makes it again"
 
 
 @dataclass(frozen=True)

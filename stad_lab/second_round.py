@@ -16,12 +16,13 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stad_lab.agent import Agent, WorldModel, load_agent, load_controller, read_world_model
+from stad_lab.agent import CONTROLLER, Agent, WorldModel, load_agent, load_controller, read_world_model
 from stad_lab.car_racing import make_env
 from stad_lab.checkpoints import checksum
-from stad_lab.controller import ACTION_SIZE, seen_columns, unpack
-from stad_lab.evolution import CONTROLLER, hand_out, make_agent
+from stad_lab.controller import seen_columns, unpack
+from stad_lab.evolution import hand_out, make_agent
 from stad_lab.frames import to_frame
+from stad_lab.mdn_rnn import ACTION_SIZE
 from stad_lab.parallel import work_alone, worker_processes
 from stad_lab.rollouts import AGENT_SETTINGS, COLLECT_SETTINGS, Rollouts, collect, drive_randomly, track_seeds
 from stad_lab.search_space import START, features, load_start, save_start, sizes

@@ -34,7 +34,7 @@ from stad_lab.drives import (
 )
 from stad_lab.evaluation import bootstrap
 from stad_lab.frames import earlier_frames
-from stad_lab.mdn_rnn import MDNRNN, check_partner, encode_rollouts, fit_mdn_rnn, load_mdn_rnn
+from stad_lab.mdn_rnn import MDNRNN, check_partner, encode_rollouts, fit_mdn_rnn, load_mdn_rnn, sample_latents
 from stad_lab.parallel import run_in_order, worker_processes
 from stad_lab.pipeline import open_record, provenance, train
 from stad_lab.probe import probe
@@ -226,7 +226,7 @@ def probe_run(variant: str, path: str | Path | None = None, drives: int = PROBE_
     """
     check_variant(variant)
     if drives < FEWEST_DRIVES:
-        raise ValueError(f"drives is {drives}: expected at least {FEWEST_DRIVES}, so that the probe has unseen ones")
+        raise ValueError(f"drives={drives}: expected at least {FEWEST_DRIVES}, so that the probe has unseen ones")
     autoencoder, mdn_rnn, stride, crop_bar, identities = load_world_model(run_folder(variant, path), variant)
     drivers = two_drivers(random_drives(drives, PROBE_SEED, processes), processes)
     return {
@@ -305,7 +305,7 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
             np.array(part)
             for part in zip(*(encode_drive(autoencoder, drive, stride, crop_bar) for drive in whole), strict=True)
         )
-        z = mu + np.exp(0.5 * logvar) * np.random.default_rng(0).standard_normal(mu.shape, np.float32)
+        z = sample_latents(mu, logvar, np.random.default_rng(0))
         active = kl_divergence(torch.from_numpy(mu), torch.from_numpy(logvar)).mean(dim=(0, 1)).numpy() > ACTIVE
         mixture = forecast(mdn_rnn, z, actions)
         counts, _ = np.histogram(pit(mixture, z)[..., active], bins=20, range=(0, 1))

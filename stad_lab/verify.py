@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stad_lab.agent import load_controller, read_world_model
+from stad_lab.agent import CONTROLLER, load_controller, read_world_model
 from stad_lab.autoencoder import check_facts, load_autoencoder
 from stad_lab.checkpoints import checksum, load_json
 from stad_lab.evolution import (
-    CONTROLLER,
     LOG,
     check_space,
     drive_group,

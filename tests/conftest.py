@@ -132,7 +132,7 @@ def agent(quick_run):
 
 @pytest.fixture(scope="session")
 def observations():
-    """Sixty observations of one drive, uint8 (60, 96, 96, 3)."""
+    """Sixty observations of one drive: a list of uint8 (96, 96, 3)."""
     env = make_env()
     seen = [env.reset(seed=7)[0]]
     env.action_space.seed(7)

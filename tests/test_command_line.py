@@ -207,8 +207,8 @@ def test_a_number_too_large_for_any_machine_ends_in_one_line(quick_run, tmp_path
 
 
 def test_a_film_of_no_frame_is_refused_before_the_drive(agent):
-    with pytest.raises(ValueError, match="every=0: expected at least 1"):
-        film_agent(agent, track=0, first=0, frames=10, every=0)
+    with pytest.raises(ValueError, match="frames=0: expected at least 1"):
+        film_agent(agent, track=0, first=0, frames=0)
 
 
 @pytest.mark.parametrize(

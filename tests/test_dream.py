@@ -92,9 +92,9 @@ def test_an_action_that_is_not_three_finite_numbers_is_refused(action, dream):
 
 
 def test_latents_that_do_not_fit_are_refused(dream):
-    with pytest.raises(ValueError, match=r"latents of shape \(5,\): expected \(32,\) finite numbers"):
+    with pytest.raises(ValueError, match=r"latents of shape \(5,\), 5 of them finite: expected \(32,\) finite numbers"):
         dream.reset(options={"latents": np.zeros(5)})
-    with pytest.raises(ValueError, match=r"expected \(32,\) finite numbers"):
+    with pytest.raises(ValueError, match=r"\(32,\), 0 of them finite: expected \(32,\) finite numbers"):
         dream.reset(options={"latents": np.full(32, np.nan)})
 
 

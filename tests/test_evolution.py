@@ -32,11 +32,11 @@ from stad_lab.evolution import (
     generation_tracks,
     make_agent,
     make_strategy,
-    mean_checksum,
     note_best,
     replay,
     tell,
     validate,
+    vector_checksum,
 )
 from stad_lab.rollouts import TRACK_RANGES
 from stad_lab.settings import Settings
@@ -281,7 +281,7 @@ def test_the_step_size_follows_its_plan_in_a_replay_too():
         assert strategy.sigma == pytest.approx(0.3 * 0.9**generation, rel=1e-12)
         returns = [[-float((agent**2).sum())] for agent in population]
         strategy.tell(population, [-one[0] for one in returns])
-        log.append({"returns": returns, "mean_checksum": mean_checksum(strategy.mean)})
+        log.append({"returns": returns, "mean_checksum": vector_checksum(strategy.mean)})
     replayed, _ = replay(np.zeros(8), planned, log)
     assert np.array_equal(ask(replayed, planned, 5), ask(strategy, planned, 5))
     with pytest.raises(ValueError, match="another mean in generation 2"):
@@ -357,7 +357,7 @@ def test_a_replay_comes_to_the_logged_means_with_any_number_of_threads():
             population = ask(strategy, Settings.preset("laptop"), generation)
             returns = [[-float((agent**2).sum())] for agent in population]
             strategy.tell(population, [-np.mean(one) for one in returns])
-            log.append({"returns": returns, "mean_checksum": mean_checksum(strategy.mean)})
+            log.append({"returns": returns, "mean_checksum": vector_checksum(strategy.mean)})
     with threadpool_limits(2):
         assert np.array_equal(replay(start, Settings.preset("laptop"), log)[1][-1], strategy.mean)
 

@@ -17,7 +17,7 @@ from stad_lab.evaluation import bootstrap, evaluate
 from stad_lab.evolution import LOG, fitness_curves
 from stad_lab.pipeline import starts, total_budget
 from stad_lab.plots import plot_curves, plot_episodes, plot_intervals, plot_returns, plot_seeds, plot_stacks
-from stad_lab.replication import describe_forecast, forecast, keep, replicate
+from stad_lab.replication import describe_time, keep, replicate, time_needed
 from stad_lab.rows import FLOORS, ROWS, Row
 from stad_lab.settings import Settings
 from stad_lab.table import (
@@ -92,7 +92,7 @@ def test_every_seed_of_a_retrained_row_is_a_whole_run_of_its_own(table, tmp_path
     assert first["autoencoder"] == logs[0]["autoencoder"] and first["generations"] == logs[0]["generations"]
     assert found["episodes"] == 8 + 8 + 2 and len(keep("anew", tmp_path, tmp_path / "kept")) == 2
     monkeypatch.setattr(replication, "speeds", lambda *_: dict.fromkeys(("V, M, C", "official", "V", "M"), 100.0))
-    one, both = (forecast("anew", seeds) for seeds in ([0], [0, 1]))
+    one, both = (time_needed("anew", seeds) for seeds in ([0], [0, 1]))
     assert both == {part: 2 * seconds for part, seconds in one.items()}
 
 
@@ -213,12 +213,12 @@ def test_the_times_of_a_row_are_those_of_all_its_stages_in_both_rounds(table, tm
     assert stage_times(tmp_path / "two") == times
 
 
-def test_the_forecast_is_measured_on_this_machine_and_says_what_takes_how_long(monkeypatch):
+def test_the_time_needed_is_measured_on_this_machine_and_says_what_takes_how_long(monkeypatch):
     monkeypatch.setitem(ROWS, "one", Row("input", "one round", Settings.preset("quick", width=4, v_batch=128)))
-    times = forecast("one")
+    times = time_needed("one")
     assert all(times[part] > 0 for part in ("rollouts", "V", "M", "searches", "evaluations"))
     assert times["first search"] == 0 and times["evaluations"] > times["searches"]  # whole episodes against brief ones
-    line = describe_forecast("one", times)
+    line = describe_time("one", times)
     assert line.startswith("one: at most ") and "searches" in line and "first search" not in line
 
 
@@ -287,13 +287,13 @@ def test_some_seeds_of_a_row_can_be_made_alone(table, monkeypatch):
     assert replicate("two", folder, seeds=[1, 1])["seeds"] == summaries["two"]["seeds"][1:]
     speeds = {"V, M, C": 10.0, "V": 10.0, "M": 10.0, "official": 10.0}
     monkeypatch.setattr(replication, "speeds", lambda *_: speeds)  # measured twice they would differ
-    whole, one = forecast("one_round"), forecast("one_round", seeds=[2])
+    whole, one = time_needed("one_round"), time_needed("one_round", seeds=[2])
     for part, share in {"rollouts": 1, "V": 1, "M": 1, "searches": 3, "evaluations": 3}.items():
         assert whole[part] == pytest.approx(share * one[part])
-    base, finished = (forecast(f"{recipe}_frame", seeds=[0]) for recipe in ("two_rounds", "finished"))
+    base, finished = (time_needed(f"{recipe}_frame", seeds=[0]) for recipe in ("two_rounds", "finished"))
     longer = (15 * 32 * 8 + 3 * 16) / (40 * 64 + 8 * 16)
     assert finished == base | {"finishes": base["searches"] * longer, "evaluations": 2 * base["evaluations"]}
-    assert forecast("untrained_M")["M"] == whole["M"] > 0  # the world that it shares has a trained M
+    assert time_needed("untrained_M")["M"] == whole["M"] > 0  # the world that it shares has a trained M
 
 
 def test_seeds_that_are_kept_one_after_the_other_leave_one_record_of_their_training(table, tmp_path):
@@ -344,7 +344,7 @@ def test_a_driver_that_does_not_look_is_a_row_like_any_other(tmp_path, monkeypat
         told = load_json(tmp_path / name / "seed0" / "evaluation.json")
         assert [episode["track"] for episode in told["episodes"]] == [0, 1, 2] and told["mean"] == row["mean"] < 200
         assert row["episodes"] == 0 and keep(name, tmp_path, tmp_path / "kept")
-        assert replicate(name, tmp_path) == row and "evaluations" in describe_forecast(name, forecast(name))
+        assert replicate(name, tmp_path) == row and "evaluations" in describe_time(name, time_needed(name))
     assert found["random_driver"]["mean"] != found["gentle_driver"]["mean"]
     for ask in (replicate, keep):
         with pytest.raises(ValueError, match="row 'random_driver' is no search and has no seeds"):

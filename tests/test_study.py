@@ -210,7 +210,7 @@ def test_the_command_probes_v_and_m_of_a_run_and_keeps_every_r2_with_its_interva
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (["--drives", "11"], "drives is 11: expected at least 12"),
+        (["--drives", "11"], "drives=11: expected at least 12"),
         (["--variant", "both"], "unknown variant 'both'"),
         (["--path", "nowhere"], "nowhere"),
     ],
