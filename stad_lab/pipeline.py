@@ -340,7 +340,7 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
         ValueError: the run is damaged, of another variant, or the shipped agent itself.
     """
     folder = Path(folder)
-    load_autoencoder(folder / WEIGHTS[0], variant)
+    load_autoencoder(folder / "autoencoder.safetensors", variant)
     target = target / "second_round" / variant if (folder / START).exists() else target / variant
     if target.resolve() == folder.resolve():
         raise ValueError(f"{folder} is where agents are shipped to: give the folder of a run")
