@@ -30,7 +30,6 @@ class Agent:
         latents: z of the last frame, float32 (cars, latent_size); None before the first.
         hidden: M's memory h that C saw with it, float32 (cars, hidden_size).
         state: M's memory (h, c) after the last action, float32 (1, cars, hidden_size) each; None before the first.
-        cars: which cars of the first step still drive, int (cars,); None before the first.
 
     Args:
         parameters: of C, (parameters,) or one row for each car (cars, parameters).
@@ -50,7 +49,7 @@ class Agent:
     def reset(self) -> None:
         """Forget the past: every episode begins with this."""
         self.memory = FrameMemory(self.stride)
-        self.cars: np.ndarray | None = None
+        self.cars: np.ndarray | None = None  # which of the cars of the first step still drive, int (cars,)
         self.state: State | None = None
         self.latents: np.ndarray | None = None
         self.hidden: np.ndarray | None = None
