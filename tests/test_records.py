@@ -146,7 +146,7 @@ def test_the_table_of_the_v_s_without_the_bar_is_that_of_their_probes():
     asked += [("trained agent", name, "z") for name in ("yaw rate", "slip speed", "wheel angle", "forward speed")]
     asked.append(("trained agent", "yaw rate", "z, h"))
     files = sorted((RECORDS / "probe").glob("*.json"))
-    assert len(files) == 6
+    assert len(files) == 8
     known, means = {}, {}
     for file in files:
         row, seed = file.stem.rsplit("_", 1)
@@ -157,6 +157,9 @@ def test_the_table_of_the_v_s_without_the_bar_is_that_of_their_probes():
         known[file.stem] = found["drivers"]["trained agent"]["z"]["yaw rate"]["r2"]
         means[file.stem] = mean = load_json(folder / "evaluation.json")["mean"]
         assert cells(f"`{row}`, seed {seed}", LATENTS) == [*told, f"{mean:.1f}"]
+    paper = {run: known.pop(run) for run in ("paper_frame_2", "paper_input_output_0")}
+    told = "tells the yaw rate with an $R^2$ of {:.2f}, that of the second `frame` with {:.2f}"
+    assert told.format(paper["paper_input_output_0"], paper["paper_frame_2"]) in NOTEBOOK
     both = [f"no_bar_input_output_{seed}" for seed in (0, 1)]
     others = sorted(known.keys() - both, key=known.get)
     assert min(known[run] for run in both) > 0.85 > 0.25 > known[others[-1]]
