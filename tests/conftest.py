@@ -99,6 +99,7 @@ def train_quickly(folder, guard):
     may_write = os.pathsep.join([str(folder), str(guard), "/dev/", "/proc/"])
     guarded = {"GUARDED": may_write, "TMPDIR": str(guard), "PYTHONPATH": str(guard), "PYTHONDONTWRITEBYTECODE": "1"}
     guarded["MPLCONFIGDIR"] = str(guard)  # matplotlib, which pycma imports, makes a folder for its own settings
+    guarded["TORCHINDUCTOR_CACHE_DIR"] = str(guard)  # a PyTorch that has trained in this process hands its own on
     begin = time.perf_counter()
     process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded)
     told = {name: getattr(process, name) for name in ("returncode", "stdout", "stderr")}

@@ -220,7 +220,7 @@ def test_an_evolution_without_its_start_is_refused_and_the_command_makes_it_agai
     before = load_file(folder / "start.safetensors")
     (folder / "start.safetensors").write_bytes(b"cut")
     with pytest.raises(
-        ValueError, match=r"start.safetensors is damaged.*delete it and run the same command again"
+        ValueError, match=r"start.safetensors is damaged.*delete it and run the command that made this run again"
     ) as error:
         train(VARIANT, SETTINGS, folder, earlier=quick_run)
     assert str(error.value).count("delete it") == 1
