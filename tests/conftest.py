@@ -8,6 +8,7 @@ os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # check_env tries render_mode
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels and commands too: the cores are shared by several tests
 os.environ.setdefault("TQDM_MININTERVAL", "1")  # a kernel's messages that nobody has read yet are dropped after 1,000
 
+import functools
 import json
 import shutil
 import subprocess
@@ -23,10 +24,11 @@ from filelock import FileLock
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from stad_lab import load_agent, make_env
-from stad_lab.agent import load_controller
+from stad_lab.agent import drive, load_controller
 from stad_lab.car_racing import FastCarRacing
 from stad_lab.checkpoints import save_tensors
 from stad_lab.controller import initial_parameters
+from stad_lab.evaluation import evaluate
 from stad_lab.settings import Settings
 
 torch.set_num_threads(1)  # the models here are tiny: more threads would only get in each other's way
@@ -160,6 +162,18 @@ def noted_tracks():
             yield tracks
 
     return note
+
+
+@pytest.fixture(scope="session")
+def evaluate_briefly():
+    """evaluate_briefly(patch): a row of the table is evaluated on one track, with the fast renderer, for 60 frames."""
+
+    def shorten(patch):
+        patch.setattr("stad_lab.replication.TRACKS", 1)
+        patch.setattr("stad_lab.replication.evaluate", functools.partial(evaluate, fast=True))
+        patch.setattr("stad_lab.evolution.drive", functools.partial(drive, max_frames=60))  # a search says its own
+
+    return shorten
 
 
 @pytest.fixture

@@ -1,6 +1,5 @@
 """A finish: the same V and M, a search from the C of before, and one budget for all of it."""
 
-import functools
 import itertools
 import shlex
 import shutil
@@ -11,9 +10,8 @@ import pytest
 
 from stad_lab import replication
 from stad_lab.__main__ import main, read_changes
-from stad_lab.agent import PRETRAINED, drive, load_agent, load_controller, read_world_model
+from stad_lab.agent import PRETRAINED, load_agent, load_controller, read_world_model
 from stad_lab.checkpoints import load_json, save_json
-from stad_lab.evaluation import evaluate
 from stad_lab.evolution import LOG, generation_tracks
 from stad_lab.finish import FINISH, begin_finish, finish, finish_settings
 from stad_lab.pipeline import ship, total_budget
@@ -178,14 +176,12 @@ def test_the_command_finishes_a_run_and_its_record_says_how(finished, quick_run,
     assert (tmp_path / "run" / LOG).read_bytes() == (finished / LOG).read_bytes()
 
 
-def test_a_row_of_finishes_goes_on_from_the_seeds_of_its_base(monkeypatch, tmp_path):
+def test_a_row_of_finishes_goes_on_from_the_seeds_of_its_base(evaluate_briefly, monkeypatch, tmp_path):
     settings = Settings.preset("quick", processes=1, generations=2, v_steps=8, m_steps=4)
     last = Settings.from_dict(settings.as_dict() | FINISH | BRIEF | {"validate_every": 2})
     monkeypatch.setitem(ROWS, "first", Row("input", "before", settings, seeds=(0, 1)))
     monkeypatch.setitem(ROWS, "last", Row("input", "after", last, seeds=(0, 1), base="first"))
-    monkeypatch.setattr(replication, "TRACKS", 1)
-    monkeypatch.setattr("stad_lab.evolution.drive", functools.partial(drive, max_frames=60))  # for evaluations alone
-    monkeypatch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
+    evaluate_briefly(monkeypatch)
     with ThreadPoolExecutor(1) as executor:
         found = replication.replicate("last", tmp_path, executor, seeds=[1])
         assert not (tmp_path / "first" / "seed0").exists() and (tmp_path / "first" / "seed1").exists()

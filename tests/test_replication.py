@@ -1,6 +1,5 @@
 """The table: one command makes a row and goes on with it, and its interval covers the truth."""
 
-import functools
 import inspect
 import shutil
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,6 @@ from PIL import Image
 
 from stad_lab import replication
 from stad_lab.__main__ import main
-from stad_lab.agent import drive
 from stad_lab.checkpoints import checksum, load_json, save_json
 from stad_lab.evaluation import bootstrap, evaluate
 from stad_lab.evolution import LOG, fitness_curves
@@ -36,7 +34,7 @@ SECOND = Settings.preset("quick", **TINY | {"agent_episodes": 2, "generations": 
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory):
+def table(evaluate_briefly, tmp_path_factory):
     """A row of two rounds and two seeds, and one that shares its world: (the folder of both, their summaries)."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(ROWS, "two", Row("input", "two rounds", SECOND, FIRST, seeds=(0, 1)))
@@ -44,9 +42,7 @@ def table(tmp_path_factory):
             ROWS, "blind", Row("input", "no M", Settings.preset("quick", **TINY, features="z"), seeds=(3,), world="one")
         )
         patch.setitem(ROWS, "one", Row("input", "one round", FIRST, seeds=(0,)))
-        patch.setattr(replication, "TRACKS", 1)
-        patch.setattr(replication, "evaluate", functools.partial(evaluate, fast=True))
-        patch.setattr("stad_lab.evolution.drive", functools.partial(drive, max_frames=60))  # for evaluations alone
+        evaluate_briefly(patch)
         folder = tmp_path_factory.mktemp("table")
         with ThreadPoolExecutor(1) as executor:
             yield folder, {name: replicate(name, folder, executor) for name in ("two", "blind")}
