@@ -10,7 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from stad_lab.autoencoder import VARIANTS
+from stad_lab.checkpoints import load_json
 from stad_lab.evaluation import bootstrap
+from stad_lab.evolution import LOG
 from stad_lab.plots import plot_claims, to_png
 from stad_lab.rows import ABLATIONS, ROWS
 from stad_lab.table import (
@@ -18,6 +20,7 @@ from stad_lab.table import (
     claims_and_outcomes,
     describe_table,
     kept_rows,
+    learning_curve,
     official_returns,
     summarise_row,
 )
@@ -53,6 +56,22 @@ def spread_table(rows: dict[str, list[Path]]) -> str:
         failed = f"{(returns < 800).sum()} of {returns.size}"
         numbers = f"{found['standard_deviation']:.0f}", f"{np.median(returns):.1f}", failed, f"{found['top_90']:.1f}"
         lines.append(line(f"`{name}`", *numbers))
+    return "\n".join(lines)
+
+
+def searches_table(rows: dict[str, list[Path]]) -> str:
+    """The searches of the paper's recipe one by one; a V is named by the first four digits of its identity."""
+    head = "search", "V", "mean of 100 tracks", "complete laps", "below 800", "last five looks", "less `frame`"
+    lines, frames = [line(*head), "|---" * len(head) + "|"], {one.name: one for one in rows["paper_frame"]}
+    for variant in VARIANTS:
+        for folder in rows.get(f"paper_{variant}", []):
+            returns, frame = official_returns([folder]), frames.get(folder.name)
+            lead = f"{returns.mean() - official_returns([frame]).mean():+.1f}" if variant != "frame" and frame else ""
+            counts = f"{(returns >= 900).sum()}", f"{(returns < 800).sum()}"
+            last = f"{learning_curve(folder)[1][-5:].mean():.0f}"
+            name = f"`paper_{variant}`, seed {folder.name.removeprefix('seed')}"
+            trained = f"`{load_json(folder / LOG)['autoencoder'][:4]}`"
+            lines.append(line(name, trained, f"{returns.mean():.1f}", *counts, last, lead))
     return "\n".join(lines)
 
 
@@ -113,7 +132,7 @@ def up_to_date(rows: dict[str, list[Path]], label: str) -> dict[Path, str]:
     missing = ", ".join(f"`{name}`" for name in ROWS if name not in rows)
     page = re.sub(r"Not made yet: [^.]*\.", f"Not made yet: {missing or 'none'}.", page)
     pages = {readme: page, results: results.read_text(encoding="utf-8")}
-    for table in (spread_table(rows), variants_table(rows), changes_table(rows)):
+    for table in (searches_table(rows), spread_table(rows), variants_table(rows), changes_table(rows)):
         pages[results] = put_table(pages[results], table)
     return pages
 
