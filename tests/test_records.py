@@ -477,9 +477,11 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     scatter = np.sqrt(sum(np.var(own) * len(own) for own in made.values()) / free)
     apart = scatter * np.sqrt(1 / len(made["output"]) + 1 / len(made["frame"]))
     assert 0.38 < 2 * t.sf(leads["output"] / apart, free) < 0.42  # "two cases of five"
-    assert 2800 < 3 * np.ptp(made["input"]) + 3 * frame - sum(made["input"]) < 2900
-    lowest = 3 * frame - sum(made["output"]), 3 * frame - sum(made["input_output"])
-    assert [round(float(score)) for score in lowest] == [98, 6]
+    third = np.linspace(-100, 1e6, 1001)  # whatever the third search of `input` has, its range is larger than its lead
+    widest = np.maximum(third, max(made["input"])) - np.minimum(third, min(made["input"]))
+    assert ((third + sum(made["input"])) / 3 - frame < widest).all()
+    lowest = [3 * frame - sum(made[variant]) for variant in ("output", "input_output", "input")]
+    assert [round(float(score)) for score in lowest] == [98, 6, 860]
     then, first = (np.mean(made["output"]), mean["input_output", 1]), np.mean(made["frame"][:2])
     assert all(0.28 < (frame - first) / (score - first) < 0.34 for score in then)  # "nearly a third of the leads"
     ratios = [leads[v] / (PAPER[v] - PAPER["frame"]) for v in ("output", "input_output")]
@@ -655,8 +657,8 @@ def test_the_rule_of_notebook_05_is_no_fair_coin():
         means = scatter * rng.standard_normal((200_000, 4, 1)) + rng.standard_normal((200_000, 4, 3))
         leads, ranges = means[:, 1:].mean(axis=2) - means[:, :1].mean(axis=2), np.ptp(means, axis=2)
         holds[scatter] = 1 / (leads > np.maximum(ranges[:, 1:], ranges[:, :1])).all(axis=1).mean()
-    told = "one case of a thousand", "in one of 56 if", "in one of fifteen if", "in one of four if V's luck is all"
-    assert all(words in NOTEBOOK for words in told)
+    for words in ("all in the search | 1,000", "much as in the search | 56", "twice as much | 15", "do not help | 4"):
+        assert f"{words} |" in NOTEBOOK, words
     ahead = np.array([0, 1, 1, 1])[:, None]  # by as much as searches scatter
     means = rng.standard_normal((200_000, 4, 3)) + ahead
     leads, ranges = means[:, 1:].mean(axis=2) - means[:, :1].mean(axis=2), np.ptp(means, axis=2)
