@@ -22,7 +22,7 @@ ENTRIES = 20  # of the history, and checkpoints, in a long run
 
 
 def training_device() -> torch.device:
-    """Where V and M are trained: on a CUDA GPU if there is one that computes, unless CUDA_VISIBLE_DEVICES is nothing.
+    """Where V and M are trained: on a CUDA GPU if there is one that computes, unless CUDA_VISIBLE_DEVICES hides it.
 
     Agents always drive on the CPU, in many processes.
     """

@@ -204,9 +204,23 @@ def test_no_figure_is_lost_because_a_cell_goes_on_after_it_is_shown(file):
             assert not any(ast.unparse(one).startswith(("show(", "show_")) for one in before), cell["id"]
 
 
+def test_the_lab_is_opened_where_every_file_that_a_notebook_links_to_is_served():
+    (command,) = [line for line in (ROOT / "README.md").read_text().splitlines() if "jupyter lab" in line]
+    places = [word for word in command.split("jupyter lab")[1].split() if not word.startswith("--")]
+    # JupyterLab serves the folder that it is given, or the one where it is started.
+    served = (ROOT / places[0] if places else ROOT).resolve()
+    linked = 0
+    for file in (ROOT / "notebooks").rglob("*.ipynb"):
+        for link in re.findall(r"\]\((\.\./[^)#]*)", file.read_text(encoding="utf-8")):
+            if "source" not in file.parts:
+                assert (file.parent / link).resolve().is_relative_to(served), (file.name, link)
+                linked += 1
+    assert linked > 5
+
+
 def test_ci_runs_the_one_test_command_of_the_readme():
     commands = [line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("python3 ")]
-    assert [command.split("/")[-1].split()[0] for command in commands] == ["jupyter", "pytest"]
+    assert [command.split("&& .venv/bin/")[-1].split()[0] for command in commands] == ["jupyter", "pytest"]
     assert all(
         command.startswith("python3 -m venv .venv && .venv/bin/pip install -r environment.txt") for command in commands
     )
