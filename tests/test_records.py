@@ -125,8 +125,9 @@ def test_the_other_figures_on_speed_v_and_m_are_those_of_the_records():
     mean = f"by {parity['whole picture, mean']:.2f} of 255"
     assert f"{mean} on average, and by {around:.2f} in the 24 x 24" in SPEED and f"differ {mean}" in README
     nll = study["mdn_rnn"]["variants"]["input"]["nll"]
-    nats = [f"{nll[name]['nats']:.3f}" for name in ("M", "linear, last z", "repeat the last z")]
-    assert "at {} nats per latent, against {} for a linear law and {} for repeating".format(*nats) in LATENTS
+    nats = [f"{nll[name]['nats']:.3f}" for name in ("M", "linear, last 4 z", "linear, last z", "repeat the last z")]
+    told = "at {} nats per latent, against {} and {} for linear laws from the last four z's and from the last one"
+    assert f"{told}, and {{}} for".format(*nats) in LATENTS
 
 
 def test_the_table_of_the_probe_is_the_study_s():
@@ -161,6 +162,13 @@ def test_the_table_of_the_v_s_without_the_bar_is_that_of_their_probes():
     told = "tells the yaw rate with an $R^2$ of {:.2f}, that of the third `frame`, which has 686, with {:.2f}"
     assert told.format(paper["paper_input_output_0"], paper["paper_frame_2"]) in NOTEBOOK
     both = [f"no_bar_input_output_{seed}" for seed in (0, 1)]
+    three = [load_json(RECORDS / "probe" / f"{run}.json")["drivers"] for run in (*both, "paper_input_output_0")]
+    yaw, wheel = (
+        sorted(found["random driver"]["z"][name]["r2"] for found in three) for name in ("yaw rate", "wheel angle")
+    )
+    spans = f"{yaw[0]:.2f} to {yaw[-1]:.2f}, and {wheel[0]:.2f} to {wheel[-1]:.2f}"
+    page = RECORDS.parent.parent / "notebooks" / "02_difference_autoencoders.ipynb"
+    assert f"(in three others {spans})" in page.read_text(encoding="utf-8")
     others = sorted(known.keys() - both, key=known.get)
     assert min(known[run] for run in both) > 0.85 > 0.25 > known[others[-1]]
     assert others[0] == "no_bar_1" == max(others, key=means.get)
@@ -341,6 +349,8 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     always = {v: np.flatnonzero((returns[f"two_rounds_{v}"] < 800).all(axis=0)).tolist() for v in VARIANTS}
     assert always == {"frame": [], "input": [2, 68], "output": [2, 19], "input_output": []}
     assert np.flatnonzero((returns["finished_input"] < 800).all(axis=0)).tolist() == [2, 19, 68]
+    bare = {name: returns[name][:, [2, 19, 68]] < 800 for name in ("no_bar", "no_bar_frame")}
+    assert bare["no_bar_frame"].all() and bare["no_bar"][:, 1].sum() == 1
     good = {name for name, found in returns.items() if found.mean() > 850}
     never = {name for name in good if returns[name][:, 19].min() > 800}
     assert never >= {name for name in good if ROWS[name].variant == "frame"} and len(never) < len(good) / 3
