@@ -408,6 +408,11 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     first = {v: [learning_curve(folder)[1][-1] for folder in sorted(first_rounds(v))] for v in ("frame", "input")}
     early = {v: learning_curve(rows[f"early_{v}"][0])[1][-1] for v in first}
     assert early["frame"] == max(first["frame"]) and early["input"] == min(first["input"])
+    told = {v: f"{returns[f'early_{v}'].mean():.1f}" for v in VARIANTS if f"early_{v}" in rows}
+    words = "`input_output` has {input_output} there, `output` {output}, `frame` {frame} and `input` {input}"
+    assert words.format(**told) in RESULTS
+    made = sum(len(rows.get(f"early_{v}", [])) for v in VARIANTS)
+    assert f"({NUMBERS[made]} of twenty are made)" in NOTEBOOK and made == 4  # docs/instructor.md: sixteen are left
     assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
 
 
