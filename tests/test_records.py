@@ -416,6 +416,22 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
     assert all(bootstrap((fast["finished", v] - fast["two_rounds", v])[None])[0] > 0 for v in VARIANTS)
 
 
+def test_what_was_made_anew_on_another_machine_came_out_to_the_last_bit():
+    table = RECORDS / "table"
+    first, again = (
+        load_json(table / run / LOG) for run in ("two_rounds_input_output/first", "early_input_output/seed0")
+    )
+    assert [(log["autoencoder"], log["mdn_rnn"]) for log in (first, again)] == [
+        (first["autoencoder"], first["mdn_rnn"])
+    ] * 2
+    means = [[generation["mean_checksum"] for generation in log["generations"]] for log in (first, again)]
+    assert means[0] == means[1] and len(means[0]) == 15
+    second, third = (table / "paper_input_output" / f"seed{seed}" for seed in (1, 2))
+    assert len(worlds([second, third])) == 1
+    commits = [load_json(folder / "record.json")["made_with"]["commit"] for folder in (second, third)]
+    assert commits[0] != commits[1]
+
+
 def test_the_instructor_s_answers_are_those_of_the_records():
     page = (Path(__file__).parent.parent / "docs" / "instructor.md").read_text()
     frame, shown = (official_returns([PRETRAINED / "second_round" / variant]) for variant in ("frame", "input"))
