@@ -45,9 +45,9 @@ RESULTS, SPEED, LATENTS, CLUSTER = (
     for name in ("results", "speed", "latents", "cluster")
 )
 STAGES = ("two_rounds", "finished")
-NOTEBOOK, LOST = (
+NOTEBOOK, LOST, DIFFERENCES = (
     (Path(__file__).parent.parent / "notebooks" / name).read_text()
-    for name in ("05_replication.ipynb", "06_lost_points.ipynb")
+    for name in ("05_replication.ipynb", "06_lost_points.ipynb", "02_difference_autoencoders.ipynb")
 )
 NUMBERS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 
@@ -167,8 +167,7 @@ def test_the_table_of_the_v_s_without_the_bar_is_that_of_their_probes():
         sorted(found["random driver"]["z"][name]["r2"] for found in three) for name in ("yaw rate", "wheel angle")
     )
     spans = f"{yaw[0]:.2f} to {yaw[-1]:.2f}, and {wheel[0]:.2f} to {wheel[-1]:.2f}"
-    page = RECORDS.parent.parent / "notebooks" / "02_difference_autoencoders.ipynb"
-    assert f"(in three others {spans})" in page.read_text(encoding="utf-8")
+    assert f"(in three others {spans})" in DIFFERENCES
     others = sorted(known.keys() - both, key=known.get)
     assert min(known[run] for run in both) > 0.85 > 0.25 > known[others[-1]]
     assert others[0] == "no_bar_1" == max(others, key=means.get)
@@ -195,8 +194,8 @@ def test_the_words_on_the_probe_hold_for_the_study():
 
 
 def test_the_table_of_the_yaw_rate_in_notebook_02_is_the_study_s():
-    probe, file = read("study.json")["probe"]["variants"], RECORDS.parent.parent / "notebooks"
-    page = json.loads((file / "02_difference_autoencoders.ipynb").read_text())
+    probe = read("study.json")["probe"]["variants"]
+    page = json.loads(DIFFERENCES)
     text = "".join("".join(cell["source"]) for cell in page["cells"] if cell["id"] == "02-35")
     for variant in VARIANTS:
         columns = itertools.product(("z", "z, h"), ("random driver", "trained agent"))
@@ -418,13 +417,10 @@ def test_the_words_of_notebook_05_hold_for_the_records_that_come_with_it():
 
 def test_what_was_made_anew_on_another_machine_came_out_to_the_last_bit():
     table = RECORDS / "table"
-    first, again = (
-        load_json(table / run / LOG) for run in ("two_rounds_input_output/first", "early_input_output/seed0")
-    )
-    assert [(log["autoencoder"], log["mdn_rnn"]) for log in (first, again)] == [
-        (first["autoencoder"], first["mdn_rnn"])
-    ] * 2
-    means = [[generation["mean_checksum"] for generation in log["generations"]] for log in (first, again)]
+    runs = [table / name for name in ("two_rounds_input_output/first", "early_input_output/seed0")]
+    assert len(worlds(runs)) == 1
+    logs = [load_json(run / LOG) for run in runs]
+    means = [[generation["mean_checksum"] for generation in log["generations"]] for log in logs]
     assert means[0] == means[1] and len(means[0]) == 15
     second, third = (table / "paper_input_output" / f"seed{seed}" for seed in (1, 2))
     assert len(worlds([second, third])) == 1
@@ -490,8 +486,8 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     assert [pairs[key] for key in six] == [175, 190, 397, 286, 393, 73]
     leading = [pairs[key] for key in six]
     told = f"the six lead by {min(leading)} to {max(leading)} points on the official tracks, and by"
-    ends = [round(float((looks[key][-5:] - looks["frame", key[1]][-5:]).mean())) for key in six]
-    assert f"{told} {min(ends)} to {max(ends)} over the last five looks" in RESULTS
+    late = [round(float((looks[key][-5:] - looks["frame", key[1]][-5:]).mean())) for key in six]
+    assert f"{told} {min(late)} to {max(late)} over the last five looks" in RESULTS
     both = [official_returns(rows[f"paper_{variant}"]) for variant in ("frame", "input_output")]
     assert f"on two V's, lie within {np.ptp(both[1].mean(axis=1)):.0f}.)" in RESULTS
     low, high = bootstrap_gain(*(found[2:] for found in both))
@@ -522,9 +518,8 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     third = np.linspace(-100, 1e6, 1001)  # whatever the third search of `input` has, its range is larger than its lead
     widest = np.maximum(third, max(made["input"])) - np.minimum(third, min(made["input"]))
     assert ((third + sum(made["input"])) / 3 - frame < widest).all()
-    assert (
-        len(made["input_output"]) == len(made["frame"]) == 3 and leads["input_output"] > 0
-    )  # so "fails" cannot, either
+    assert len(made["input_output"]) == len(made["frame"]) == 3
+    assert leads["input_output"] > 0  # so "fails" cannot come back, either
     then, first = (np.mean(made["output"]), mean["input_output", 1]), np.mean(made["frame"][:2])
     assert all(0.28 < (frame - first) / (score - first) < 0.34 for score in then)  # "nearly a third of the leads"
     ratios = [leads[v] / (PAPER[v] - PAPER["frame"]) for v in ("output", "input_output")]
@@ -541,11 +536,9 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     assert [flattered[key] for key in about] == [95, 114, 102, 105, 94, 104]
     assert [flattered[key] for key in (("frame", 1), ("output", 1), ("input_output", 1))] == [6, 8, 67]
     paired = []
-    for key in six:
-        partner = "frame", key[1]
-        paired.append([round(float((looks[key][-5:] - looks[partner][-5:]).mean()))])
-        average = curves[key][1] - curves[partner][1]
-        paired[-1] += [round(float(average[start : start + 100].mean())) for start in (0, 100)]
+    for key, lead in zip(six, late, strict=True):
+        average = curves[key][1] - curves["frame", key[1]][1]
+        paired.append([lead, *(round(float(average[start : start + 100].mean())) for start in (0, 100))])
     assert paired == [
         [25, 151, 304],
         [156, -35, 190],
