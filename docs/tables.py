@@ -84,7 +84,8 @@ def variants_table(rows: dict[str, list[Path]]) -> str:
     for variant in VARIANTS:
         cells = [f"`{variant}`, official"]
         before, after = (official_returns(rows[f"{recipe}_{variant}"]) for recipe in ("two_rounds", "finished"))
-        gain = after - before[: len(after)]
+        finished = {folder.name for folder in rows[f"finished_{variant}"]}
+        gain = after - official_returns([one for one in rows[f"two_rounds_{variant}"] if one.name in finished])
         told = f"{np.median(before):.1f}", "{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain))
         for frame, returns, extra in zip(frames, (before, after), told, strict=True):
             low, high = bootstrap_gain(frame, returns)

@@ -19,6 +19,8 @@ if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports t
     escape_foreign_letters()
     sys.exit(tell_environment())
 
+import torch
+
 from stad_lab.agent import load_agent, load_world_model, run_folder
 from stad_lab.autoencoder import VARIANTS, check_variant
 from stad_lab.benchmark import PARTS, benchmark
@@ -72,6 +74,11 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     except (MemoryError, OverflowError) as error:
         print(f"error: too large for this machine: {error or type(error).__name__}", file=sys.stderr)
+        return 2
+    except RuntimeError as error:  # PyTorch's way of saying so, of its allocator for the CPU
+        if not isinstance(error, torch.OutOfMemoryError) and "allocate memory" not in str(error):
+            raise
+        print(f"error: too large for this machine: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if options.resumes else ""
@@ -133,8 +140,9 @@ def read_changes(changes: list[str]) -> dict:
             raise ValueError(f"--set {change!r}: expected NAME=VALUE, for example stride=2")
         try:
             kind = kinds.get(name, str)
-            values[name] = text if kind is str else json.loads(text.lower() if kind is bool else text)
-        except json.JSONDecodeError:
+            read = {str: str, float: float, bool: lambda answer: json.loads(answer.lower())}.get(kind, json.loads)
+            values[name] = read(text)
+        except ValueError:
             hint = " (true or false)" if kinds.get(name) is bool else ""
             raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}{hint}") from None
     return values

@@ -151,12 +151,12 @@ def read_finished(earlier: Path) -> dict:
         FileNotFoundError: there is no run, or no log of a search.
     """
     record = load_json(earlier / "record.json", GIVE_A_RUN)
-    log, settings = load_json(earlier / LOG, GIVE_A_RUN)["generations"], record["settings"]
-    whole = settings["generations"] * settings["population"]
-    if len(log) != settings["generations"] or record.get("budget", {}).get("agents") != whole:
+    log = load_json(earlier / LOG, GIVE_A_RUN)
+    done, asked = len(log["generations"]), log["settings"]["generations"]  # of a longer run the log knows first
+    if done != asked or record.get("budget", {}).get("agents") != asked * record["settings"]["population"]:
         raise ValueError(
-            f"the search in {earlier} is not at its end, with {len(log)} of {settings['generations']} generations: run"
-            " its own command to the end first"
+            f"the search in {earlier} is not at its end, with {done} of {asked} generations: run its own command to the"
+            " end first"
         )
     return record
 

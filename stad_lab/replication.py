@@ -13,6 +13,7 @@ at the road. Whatever is there already is not done again.
 """
 
 import dataclasses
+import filecmp
 import shutil
 import tempfile
 import time
@@ -38,7 +39,7 @@ from stad_lab.rollouts import RandomDriver, collect_rollouts
 from stad_lab.rows import ROWS, Row, find_row, is_floor
 from stad_lab.search_space import COMPONENTS, START
 from stad_lab.settings import Settings, check_same_run
-from stad_lab.table import RECORDS, TOP, summarise_row, worlds
+from stad_lab.table import RECORDS, TOP, seed_folders, summarise_row, worlds
 
 KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every run, as far as it has them
 TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
@@ -137,17 +138,24 @@ def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path 
 def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, executor: Executor | None) -> None:
     """Search for C with one seed, and drive what was found on the official tracks.
 
-    Where a search begins, and along which components, depends on the world alone: the first seed finds it for all.
+    Where a search begins, and along which components, depends on the world alone: the first seed finds it for all,
+    but for a seed from elsewhere, with V and M of another training.
     """
     folder.mkdir(parents=True, exist_ok=True)
     trained = ("autoencoder", "mdn_rnn") if row.settings.m_steps else ("autoencoder",)
     made = [world / f"{part}.safetensors" for part in trained]
-    made += [path for part in (COMPONENTS, START) for path in folder.parent.glob(f"seed*/{part}")]
-    for source in made:
+    alike = [seed for seed in seed_folders(folder.parent) if all(same_file(seed / file.name, file) for file in made)]
+    found = [seed / name for seed in alike for name in (COMPONENTS, START) if (seed / name).exists()]
+    for source in made + found:
         if not (folder / source.name).exists():
             copy_file(source, folder)
     train(row.variant, row.settings_of(seed), folder, world / "rollouts", executor=executor, earlier=first)
     evaluate_row(row, folder, executor)
+
+
+def same_file(one: Path, other: Path) -> bool:
+    """Whether both files are there and hold the same bytes."""
+    return one.exists() and other.exists() and filecmp.cmp(one, other, shallow=False)
 
 
 def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
@@ -178,7 +186,7 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[
             copy_records(source, kept[-1])
     seed_0 = Path(folder) / name / "seed0"
     with_seed_0 = bool(kept) and (seed_0 / "evaluation.json").exists()
-    known = worlds(kept) <= worlds([path for path in (target / name).glob("seed*") if path not in kept])
+    known = worlds(kept) <= worlds([path for path in seed_folders(target / name) if path not in kept])
     for part in ("first", "world"):
         if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
             own = part if with_seed_0 else f"{part}_of_{kept[0].name}"

@@ -39,8 +39,16 @@ TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
 
 def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
     """The rows that have been made: name -> folders of its finished seeds, in the order of FLOORS and ROWS."""
-    found = {name: sorted((records / name).glob("seed*/evaluation.json")) for name in [*FLOORS, *ROWS]}
-    return {name: [file.parent for file in files] for name, files in found.items() if files}
+    found = {
+        name: [seed for seed in seed_folders(records / name) if (seed / "evaluation.json").exists()]
+        for name in [*FLOORS, *ROWS]
+    }
+    return {name: folders for name, folders in found.items() if folders}
+
+
+def seed_folders(row: Path) -> list[Path]:
+    """The folders `seed0`, `seed1` and so on of a row; not a `seed0_old` beside them, which would count twice."""
+    return sorted(path for path in row.glob("seed*") if path.name.removeprefix("seed").isdecimal())
 
 
 def describe_table(rows: dict[str, list[Path]]) -> str:

@@ -4,13 +4,14 @@ The same seed, settings, versions, processor and number of threads give equal bi
 episode can be driven again to the same return, and a log of CMA-ES can be told again to the same mean.
 """
 
+import dataclasses
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
 
-from stad_lab.agent import CONTROLLER, load_controller, read_world_model
+from stad_lab.agent import CONTROLLER, WorldModel, load_controller, read_world_model
 from stad_lab.autoencoder import check_facts, load_autoencoder
 from stad_lab.checkpoints import checksum, load_json
 from stad_lab.evolution import (
@@ -129,12 +130,18 @@ def lacks(folder: Path, *names: str) -> bool:
     return not any(file.exists() for file in weights) or not all((folder / name).exists() for name in names)
 
 
+def read_longest_log(variant: str, settings: Settings, folder: Path, world_model: WorldModel) -> dict:
+    """The log as `read_log`; of a run that is being made longer it knows how long before the settings of the record."""
+    asked = load_json(folder / LOG)["settings"]["generations"]
+    return read_log(variant, dataclasses.replace(settings, generations=asked), folder, world_model)
+
+
 def verify_log(folder: Path, variant: str, settings: Settings) -> str:
     """Tell CMA-ES every logged generation again: it must come to the logged means."""
     if lacks(folder, LOG):
         return f"none: {NOT_HERE}"
     world_model = read_world_model(folder, variant)
-    log = read_log(variant, settings, folder, world_model)
+    log = read_longest_log(variant, settings, folder, world_model)
     space = search_space(settings, world_model, folder)
     try:
         _, means = replay(space.first, settings, log["generations"])
@@ -148,7 +155,7 @@ def verify_controller(folder: Path, variant: str, settings: Settings) -> str:
     """Check that C is the one that the log calls the best."""
     if lacks(folder, LOG, CONTROLLER):
         return f"none: {NOT_HERE}"
-    log = read_log(variant, settings, folder, read_world_model(folder, variant))
+    log = read_longest_log(variant, settings, folder, read_world_model(folder, variant))
     kept, best = kept_generation(variant, folder, log), log["best"]
     if best is None or kept != best["generation"]:
         raise ValueError(f"{folder / CONTROLLER} is the C of generation {kept}, the log calls {best} the best")
@@ -180,7 +187,7 @@ def drive_again(folder: Path, variant: str, settings: Settings, executor: Execut
             tasks = [(source, variant, parameters, [episode["track"]], fast, None) for episode in chosen]
             driven = [float(returns[0]) for returns, _ in run_in_order(executor, drive_group, tasks)]
         else:  # all the tracks, because last bits depend on the cars that drive in step
-            log = read_log(variant, settings, folder, read_world_model(folder, variant))
+            log = read_longest_log(variant, settings, folder, read_world_model(folder, variant))
             look = log["generations"][kept_generation(variant, folder, log) - 1]
             recorded = look["validation"]["returns"][:AGAIN]
             driven = validate(executor, source, variant, settings, parameters)["returns"][:AGAIN]

@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image, ImageSequence
 
 from stad_lab.__main__ import build_parser, main, read_changes
@@ -204,6 +205,27 @@ def test_a_number_too_large_for_any_machine_ends_in_one_line(quick_run, tmp_path
     command = ["evaluate", "--variant", "input_output", "--path", quick_run, "--json", file, "--processes", 2**31]
     assert main([str(argument) for argument in command]) == 2
     assert "error: too large for this machine: " in capsys.readouterr().err and not file.exists()
+
+
+@pytest.mark.parametrize("error", [None, torch.OutOfMemoryError("CUDA out of memory")])
+def test_a_lack_of_memory_that_pytorch_finds_ends_in_one_line(error, tmp_path, monkeypatch, capsys):
+    def train(*_, **__):
+        if error:
+            raise error
+        torch.empty(2**50)
+
+    monkeypatch.setattr("stad_lab.__main__.train", train)
+    assert "too large for this machine" in the_error(capsys, train_quickly(tmp_path / "run"))
+
+
+def test_an_error_of_ours_is_not_taken_for_a_lack_of_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr("stad_lab.__main__.train", lambda *_, **__: torch.ones(2) @ torch.ones(3))
+    with pytest.raises(RuntimeError, match="inconsistent tensor size"):
+        main(train_quickly(str(tmp_path / "run")))
+
+
+def test_a_number_may_be_written_as_people_write_it():
+    assert read_changes(["sigma=.5", "kl_weight=2"]) == {"sigma": 0.5, "kl_weight": 2.0}
 
 
 def test_a_film_of_no_frame_is_refused_before_the_drive(agent):

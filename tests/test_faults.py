@@ -566,6 +566,24 @@ def test_verify_tells_of_a_part_of_another_run_on_its_own_line(name, part, whole
     assert verify(folder, in_this_process)[part].startswith("FAILED")
 
 
+def test_a_longer_run_that_was_killed_on_its_way_is_well_and_not_at_its_end(quick_run, tmp_path, in_this_process):
+    run = shutil.copytree(quick_run, tmp_path / "run")
+    longer = dataclasses.replace(SETTINGS, generations=8)
+
+    def kill(generations):
+        if len(generations) == 6:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        evolve(VARIANT, longer, run, in_this_process, watch=kill)
+    assert load_json(run / "record.json")["settings"]["generations"] == 4
+    found = verify(run, in_this_process)
+    assert not [outcome for outcome in found.values() if outcome.startswith("FAILED")]
+    assert found["log of CMA-ES"] == "ok: 6 generations lead to the same mean"
+    with pytest.raises(ValueError, match="is not at its end, with 6 of 8 generations"):
+        pipeline.read_finished(run)
+
+
 def test_records_that_were_kept_without_their_weights_are_no_failure(in_this_process):
     found = verify(RECORDS / "no_M" / "seed0", in_this_process)
     assert not [outcome for outcome in found.values() if outcome.startswith("FAILED")]

@@ -71,6 +71,22 @@ def test_where_the_searches_of_a_row_begin_is_found_once(table, tmp_path, capsys
         assert (tmp_path / "two" / seed / LOG).read_bytes() == (folder / "two" / seed / LOG).read_bytes()
 
 
+def test_a_search_begins_where_its_own_world_says_though_a_seed_of_another_training_lies_beside_it(table, tmp_path):
+    made, own = table[0] / "two", tmp_path / "two"
+    shutil.copytree(made, own, ignore=shutil.ignore_patterns("seed1"))
+    for name in ("autoencoder.safetensors", "components.safetensors", "start.safetensors"):
+        (own / "seed0" / name).write_bytes(b"of another training")
+    with ThreadPoolExecutor(1) as executor:
+        replication.search(ROWS["two"], 1, own / "seed1", own / "first", own / "world", executor)
+    assert (own / "seed1" / LOG).read_bytes() == (made / "seed1" / LOG).read_bytes()
+
+
+def test_a_folder_beside_the_seeds_is_no_seed(table, tmp_path):
+    for name in ("seed0", "seed0_old", "seed1.bak"):
+        shutil.copytree(table[0] / "two" / "seed0", tmp_path / "two" / name, ignore=shutil.ignore_patterns("rollouts"))
+    assert kept_rows(tmp_path) == {"two": [tmp_path / "two" / "seed0"]}
+
+
 def test_a_row_that_shares_a_world_trains_none_of_its_own(table):
     folder, _ = table
     assert {path.name for path in (folder / "blind").iterdir()} == {"seed3"}
