@@ -19,6 +19,7 @@ import torch
 from torch import nn
 
 from stad_lab.checkpoints import checksum_of_tensors, load_into, load_tensors, locked, save_tensors
+from stad_lab.frames import check_pair
 from stad_lab.rollouts import Rollouts, check_seen
 from stad_lab.settings import Settings, check_same_run
 from stad_lab.training import fit, training_device
@@ -162,7 +163,11 @@ def to_pictures(
 
     The pictures come as float32 (batch, 3, 64, 64) on `device`, in the "channels last" memory order of the frames:
     convolutions on a CPU are faster on it.
+
+    Raises:
+        ValueError: shapes that differ, or a dtype other than uint8.
     """
+    check_pair(frames, earlier)
     pictures = (torch.from_numpy(part).to(device).permute(0, 3, 1, 2) for part in (frames, earlier))
     frame, before = (picture.float().div_(255) for picture in pictures)
     return frame, frame - before

@@ -67,7 +67,7 @@ class DreamEnv(gym.Env):
             z and {"hidden": h}.
 
         Raises:
-            ValueError: latents of another shape, or not finite.
+            ValueError: latents or a memory of another shape, or not finite.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -83,6 +83,13 @@ class DreamEnv(gym.Env):
         self.latents = torch.from_numpy(latents.copy())
         zeros = torch.zeros(1, 1, self.mdn_rnn.hidden_size)
         self.state: State = options.get("state") or (zeros, zeros.clone())
+        for part in self.state:
+            if part.shape != zeros.shape or not torch.isfinite(part).all():
+                finite = f"{torch.isfinite(part).sum()} of them finite"
+                raise ValueError(
+                    f"a memory of shape {tuple(part.shape)}, {finite}: expected {tuple(zeros.shape)} finite numbers,"
+                    " M's h and c of one car"
+                )
         self.prediction: Mixture | None = None
         self.frames = 0
         return self.latents.numpy().copy(), self._info()

@@ -119,7 +119,7 @@ def record_random_drive(settings: Settings, index: int) -> Drive:
 def record_drive(agent: Agent, track: int, frames: int) -> Drive:
     """A drive of an agent from the start of a track, at most `frames` long."""
     env = make_env()
-    observation, _ = env.reset(seed=track)
+    observation, _ = env.reset(seed=int(track))  # one that NumPy has chosen is NumPy's, which Gymnasium refuses
     agent.reset()
     return record(env, observation, agent.act, frames)
 

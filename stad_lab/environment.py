@@ -130,7 +130,8 @@ def check_python() -> Iterator[Line]:
         yield Line(RED, "stad_lab", f"not installed for {sys.executable}", INSTALL)
         return
     yield Line(GREEN, "stad_lab", version("stad_lab"))
-    yield compare("Python", platform.python_version(), wanted, f"make a new environment with a Python {wanted}")
+    found = platform.python_version().rstrip("+")  # of a build from a branch, 3.12.3+: as good as 3.12.3
+    yield compare("Python", found, wanted, f"make a new environment with a Python {wanted}")
 
 
 def check_packages() -> Iterator[Line]:

@@ -50,12 +50,17 @@ def difference_image(frame: np.ndarray, earlier: np.ndarray) -> np.ndarray:
     Raises:
         ValueError: shapes that differ, or a dtype other than uint8.
     """
+    check_pair(frame, earlier)
+    return (frame.astype(np.float32) - earlier.astype(np.float32)) / 255
+
+
+def check_pair(frame: np.ndarray, earlier: np.ndarray) -> None:
+    """Raise ValueError unless frames and those before them are two uint8 arrays of one shape."""
     if frame.shape != earlier.shape or frame.dtype != np.uint8 or earlier.dtype != np.uint8:
         raise ValueError(
             f"frames of shape {frame.shape} {frame.dtype} and {earlier.shape} {earlier.dtype}:"
             " expected two uint8 arrays of one shape"
         )
-    return (frame.astype(np.float32) - earlier.astype(np.float32)) / 255
 
 
 def check_stride(stride: int) -> None:

@@ -80,18 +80,16 @@ def fit(
         progress = tqdm(read_ahead(batch, range(start, steps)), label, steps, initial=start, unit="step")
         for step, present in progress:
             found = losses(*present)
-            if not torch.isfinite(found["total"]):
-                raise FloatingPointError(
-                    f"{label}: the loss is {found['total'].item()} in step {step}: lower the learning rate, in a new"
-                    " folder"
-                )
+            check_loss(found["total"].item(), label, step)
             update(model, optimizer, found["total"], learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps)))
             for name, loss in found.items():
                 sums[name] = sums.get(name, 0.0) + loss.item()
             if (step + 1) % every == 0 or step + 1 == steps:
                 count = step + 1 - (history[-1]["step"] if history else 0)
                 means = {name: total / count for name, total in sums.items()}
-                history.append({"step": step + 1, "train": means, "heldout": heldout_losses()})
+                heldout = heldout_losses()
+                check_loss(heldout["total"], label, step)  # after the last update no other would tell
+                history.append({"step": step + 1, "train": means, "heldout": heldout})
                 sums = {}
                 progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
                 save_state(checkpoint, model, optimizer, history, identity)
@@ -102,6 +100,14 @@ def fit(
         print(f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint")
         raise
     return history
+
+
+def check_loss(total: float, label: str, step: int) -> None:
+    """Raise FloatingPointError unless a loss is finite."""
+    if not math.isfinite(total):
+        raise FloatingPointError(
+            f"{label}: the loss is {total} in step {step}: lower the learning rate, in a new folder"
+        )
 
 
 def update(model: torch.nn.Module, optimizer: torch.optim.Optimizer, total: torch.Tensor, rate: float) -> None:

@@ -70,6 +70,13 @@ def test_pictures_weights_and_losses_stay_on_one_device(variant):
     assert {parameter.grad.device.type for parameter in autoencoder.parameters()} == {"meta"}
 
 
+def test_frames_that_are_no_bytes_are_refused_and_stay_what_they_are():
+    frames = np.full((2, 64, 64, 3), 255, np.float32)
+    with pytest.raises(ValueError, match=r"\(2, 64, 64, 3\) float32 .*: expected two uint8 arrays of one shape"):
+        to_pictures(frames, frames)
+    assert (frames == 255).all()
+
+
 @pytest.mark.parametrize(
     ("variant", "seen", "redrawn"), [("frame", 3, 3), ("input", 6, 3), ("output", 3, 6), ("input_output", 6, 6)]
 )

@@ -98,6 +98,13 @@ def test_latents_that_do_not_fit_are_refused(dream):
         dream.reset(options={"latents": np.full(32, np.nan)})
 
 
+@pytest.mark.parametrize(("cars", "value"), [(3, 0.0), (1, np.nan)])
+def test_a_memory_that_does_not_fit_is_refused(cars, value, dream):
+    state = (torch.full((1, cars, dream.mdn_rnn.hidden_size), value),) * 2
+    with pytest.raises(ValueError, match=rf"a memory of shape \(1, {cars}, .*: expected \(1, 1, .*, M's h and c"):
+        dream.reset(options={"state": state})
+
+
 @pytest.mark.parametrize("temperature", [0, -1, 1e-40, float("nan")])
 def test_a_temperature_that_is_no_positive_number_is_refused(temperature, agent):
     with pytest.raises(ValueError, match=f"temperature={temperature}: expected a .*number above 0"):
@@ -160,7 +167,7 @@ def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent,
 
 
 def test_an_agent_in_a_film_dreams_on_from_its_own_drive_and_is_woken_in_time(agent):
-    drive = record_drive(agent, track=3, frames=25)
+    drive = record_drive(agent, track=np.int64(3), frames=25)
     dreams = naps(agent, drive, first=6, length=8)
     assert dreams.shape == (len(drive) - 6, 64, 64, 3)
     for nap, moment in enumerate((6, 14, 22)):

@@ -566,6 +566,13 @@ def test_verify_tells_of_a_part_of_another_run_on_its_own_line(name, part, whole
     assert verify(folder, in_this_process)[part].startswith("FAILED")
 
 
+def test_weights_without_a_log_or_an_evaluation_have_no_drives_to_verify(quick_run, tmp_path, in_this_process):
+    run = shutil.copytree(quick_run, tmp_path / "run", ignore=shutil.ignore_patterns("evolution.json", "rollouts"))
+    found = verify(run, in_this_process)
+    assert {name for name, outcome in found.items() if outcome.startswith("none")} >= {"log of CMA-ES", "C", "drives"}
+    assert not [outcome for outcome in found.values() if outcome.startswith("FAILED")]
+
+
 def test_a_longer_run_that_was_killed_on_its_way_is_well_and_not_at_its_end(quick_run, tmp_path, in_this_process):
     run = shutil.copytree(quick_run, tmp_path / "run")
     longer = dataclasses.replace(SETTINGS, generations=8)

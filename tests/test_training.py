@@ -18,6 +18,15 @@ def test_the_rate_falls_from_the_first_step_to_a_tenth_in_the_last(tmp_path, mon
     assert rates[-1] == pytest.approx(0.05, rel=0.01) and rates == sorted(rates, reverse=True)
 
 
+def test_weights_that_the_last_step_has_spoilt_are_not_saved(tmp_path):
+    model = torch.nn.Linear(1, 1)
+    losses = lambda x: {"total": torch.sqrt(0 * model(x)).sum()}  # noqa: E731  finite, but its gradient is not
+    heldout = lambda: {"total": model(torch.ones(1)).item()}  # noqa: E731
+    with pytest.raises(FloatingPointError, match="fit: the loss is nan in step 0"):
+        fit(model, lambda step: (torch.ones(1),), losses, heldout, 1, 0.5, tmp_path / "state", "fit", {})
+    assert not (tmp_path / "state").exists()
+
+
 @pytest.mark.parametrize(("slope", "moved"), [(3.0, 3.0), (1e6, 100.0)])
 def test_a_gradient_is_shortened_to_a_norm_of_100(slope, moved):
     model = torch.nn.Linear(1, 1, bias=False)
