@@ -2,6 +2,7 @@
 
 import ast
 import contextlib
+import dis
 import importlib.metadata
 import json
 import re
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import CodeType
 
 import pytest
 
@@ -194,6 +196,30 @@ def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     long = [cell["id"] for cell in cells if cell["cell_type"] == "code" and len(cell["source"]) > 15]
     assert long == []
     assert "check_environment()" in "".join(next(cell["source"] for cell in cells if cell["cell_type"] == "code"))
+
+
+def names_in(source):
+    """The names of a notebook that a cell reads without having bound them itself before, and those that it binds."""
+    read, bound, codes = set(), set(), [compile(source, "cell", "exec")]
+    for code in codes:
+        codes += [inner for inner in code.co_consts if isinstance(inner, CodeType)]
+        for instruction in dis.get_instructions(code):
+            if instruction.opname == "STORE_NAME":
+                bound.add(instruction.argval)
+            elif instruction.opname in ("LOAD_NAME", "LOAD_GLOBAL") and instruction.argval not in bound:
+                read.add(instruction.argval)
+    return read, bound
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)
+def test_a_cell_that_runs_again_finds_what_it_read_at_first_whatever_ran_after_it(file):
+    cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
+    sources = {cell["id"]: "".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"}
+    names = {cell: names_in(re.sub(r"^%.*$", "", source, flags=re.M)) for cell, source in sources.items()}
+    order = list(names)
+    for place, cell in enumerate(order):
+        before, after = (set().union(*(names[one][1] for one in part)) for part in (order[:place], order[place + 1 :]))
+        assert sorted(names[cell][0] & before & after) == [], cell
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)
