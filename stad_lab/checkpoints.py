@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,6 +23,7 @@ from safetensors.torch import load, save
 
 KIND = "stad_lab"
 CHECKSUM = "checksum"
+PATIENCE = 1.0 if os.name == "nt" else 0.0  # seconds: on Windows a virus scanner may hold a file for a moment
 
 
 @contextmanager
@@ -65,13 +67,26 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        temporary.replace(path)
+        replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+def replace(temporary: Path, path: Path) -> None:
+    """Rename a file to the name of another one; PermissionError if PATIENCE does not help."""
+    deadline = time.monotonic() + PATIENCE
+    while True:
+        try:
+            temporary.replace(path)
+            return
+        except PermissionError:
+            if time.monotonic() >= deadline:
+                raise
+        time.sleep(0.02)
 
 
 def unwritable(path: Path, error: OSError) -> OSError:

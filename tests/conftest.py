@@ -86,7 +86,7 @@ def quick_training(tmp_path_factory, worker_id):
     with FileLock(shared / "quick_training.lock"):
         if not told.exists():
             told.write_text(json.dumps(train_quickly(shared / "quick", shared / "guard")))
-    outcome = json.loads(told.read_text())
+    outcome = json.loads(told.read_text(encoding="utf-8"))
     assert outcome["returncode"] == 0, outcome["stderr"]
     folder = tmp_path_factory.mktemp("runs") / "quick"
     shutil.copytree(shared / "quick", folder)

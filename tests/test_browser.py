@@ -60,7 +60,7 @@ def lab(tmp_path_factory):
             urllib.request.urlopen(f"{address}/api?token=t", timeout=5)
             break
         except OSError:
-            assert server.poll() is None, (folder / "server.log").read_text()
+            assert server.poll() is None, (folder / "server.log").read_text(encoding="utf-8")
             time.sleep(0.1)
     yield address, folder
     server.send_signal(signal.SIGTERM)
@@ -287,10 +287,14 @@ def generation(picture):
 @pytest.mark.long
 def test_the_first_notebook_runs_to_its_end_in_the_browser(run, lab):
     name = "00_first_drive.ipynb"
-    page = run(name=name, content=json.loads((NOTEBOOKS / name).read_text()))
+    page = run(name=name, content=json.loads((NOTEBOOKS / name).read_text(encoding="utf-8")))
 
     def code_cells():
-        return [cell for cell in json.loads((lab[1] / name).read_text())["cells"] if cell["cell_type"] == "code"]
+        return [
+            cell
+            for cell in json.loads((lab[1] / name).read_text(encoding="utf-8"))["cells"]
+            if cell["cell_type"] == "code"
+        ]
 
     def is_done():
         page.keyboard.press("Control+s")

@@ -57,7 +57,7 @@ def scheduler(tmp_path_factory):
 
 def load_address(contact):
     """The address in a scheduler's contact file, which Dask writes (so it has no checksum of ours)."""
-    return json.loads(contact.read_text())["address"]
+    return json.loads(contact.read_text(encoding="utf-8"))["address"]
 
 
 def wait_for(condition, seconds=60):
@@ -135,18 +135,20 @@ def test_a_worker_killed_in_mid_generation_costs_a_retry_and_not_the_run(schedul
     with cluster(address) as executor:
 
         def kill_one():
-            wait_for(lambda: busy(executor) and (folder / "evolution.json").exists())
-            name = next(iter(busy(executor)))
-            workers[name].kill()
-            killed.append(name)
+            wait_for(find_one)
+            workers[victims[0]].kill()
 
-        killed = []
+        def find_one():
+            victims.extend(busy(executor)[: (folder / "evolution.json").exists()])
+            return victims
+
+        victims = []
         killer = threading.Thread(target=kill_one)
         killer.start()
         evolve(VARIANT, SETTINGS, folder, executor)
         killer.join()
         wait_for(lambda: len(executor._client.scheduler_info()["workers"]) == WORKERS - 1)
-    assert len(killed) == 1
+    assert len(victims) == 1
     assert len(load_json(folder / "evolution.json")["generations"]) == SETTINGS.generations
     assert_equal_results(folder, quick_run, "controller")
 

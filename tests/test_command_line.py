@@ -68,7 +68,7 @@ def test_a_run_leaves_weights_log_and_record(quick_training):
         assert f"{stage}: done" in process.stdout
     names = ["autoencoder", "controller", "mdn_rnn"]
     assert sorted(file.stem for file in folder.glob("*.safetensors")) == names
-    record = json.loads((folder / "record.json").read_text())
+    record = json.loads((folder / "record.json").read_text(encoding="utf-8"))
     assert record["variant"] == "input_output"
     assert Settings.from_dict(record["settings"]) == PRESETS["quick"]
     assert record["seconds"].keys() == {"rollouts", "autoencoder", "mdn_rnn", "controller"}
@@ -174,7 +174,7 @@ def test_until_stops_after_a_stage_and_set_changes_a_setting(tmp_path, capsys):
     assert main([str(argument) for argument in arguments]) == 0
     assert "rollouts: done" in capsys.readouterr().out
     assert sorted(path.name for path in tmp_path.iterdir()) == [".lock", "record.json", "rollouts"]
-    settings = json.loads((tmp_path / "record.json").read_text())["settings"]
+    settings = json.loads((tmp_path / "record.json").read_text(encoding="utf-8"))["settings"]
     changes = {"stride": 2, "episodes": 2, "crop_bar": False, "kl_weight": 0.5}
     assert Settings.from_dict(settings) == Settings.preset("quick", **changes)
 
@@ -226,6 +226,25 @@ def test_an_error_of_ours_is_not_taken_for_a_lack_of_memory(tmp_path, monkeypatc
 
 def test_a_number_may_be_written_as_people_write_it():
     assert read_changes(["sigma=.5", "kl_weight=2"]) == {"sigma": 0.5, "kl_weight": 2.0}
+
+
+def test_every_command_line_of_the_pages_is_one():
+    root = Path(__file__).parent.parent
+    pages = [page.read_text(encoding="utf-8") for page in (root / "README.md", *(root / "docs").glob("*.md"))]
+    blocks = [block for page in pages for block in re.findall(r"^```sh\n(.*?)^```", page, re.M | re.S)]
+    lines = [line for block in blocks for line in re.findall(r"^\S*python -m stad_lab (.*)$", block, re.M)]
+    for line in lines:
+        build_parser().parse_args(shlex.split(line, comments=True))
+    assert len(lines) > 15
+
+
+def test_the_script_of_the_readme_runs():
+    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```", readme, re.M | re.S)
+    whole = '"CarRacing-v3")'
+    assert block.count(whole) == 1
+    exec(block.replace(whole, '"CarRacing-v3", max_episode_steps=4)'), names := {})
+    assert names["ended"] and names["truncated"]
 
 
 def test_a_film_of_no_frame_is_refused_before_the_drive(agent):

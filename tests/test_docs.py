@@ -54,9 +54,13 @@ def site(tmp_path_factory):
 
 
 def test_the_readme_s_gallery_shows_figures_of_cells_that_there_are():
-    readme, cells = (ROOT / "README.md").read_text(), set()
+    readme, cells = (ROOT / "README.md").read_text(encoding="utf-8"), set()
     for notebook in (ROOT / "notebooks").glob("0*.ipynb"):
-        cells |= {cell["id"] for cell in json.loads(notebook.read_text())["cells"] if cell["cell_type"] == "code"}
+        cells |= {
+            cell["id"]
+            for cell in json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+            if cell["cell_type"] == "code"
+        }
     pictures = {file.stem: file for file in (ROOT / "notebooks" / "pictures").glob("0*.png")}
     assert set(gallery.CELLS) == set(pictures) <= cells
     for cell, file in pictures.items():
@@ -89,18 +93,18 @@ def test_every_notebook_and_every_room_has_its_page_and_the_search_its_index(sit
     rooms = {file.stem for file in (ROOT / "stad_lab").glob("*.py")} - {"__init__", "__main__"}
     assert notebooks <= {file.stem for file in (folder / "notebooks").glob("*.html")}
     assert rooms == {file.stem.removeprefix("stad_lab.") for file in (folder / "docs" / "rooms").glob("*.html")}
-    assert "load_agent" in (folder / "docs" / "rooms" / "stad_lab.agent.html").read_text()
-    assert "notebooks/02_difference_autoencoders" in (folder / "searchindex.js").read_text()
+    assert "load_agent" in (folder / "docs" / "rooms" / "stad_lab.agent.html").read_text(encoding="utf-8")
+    assert "notebooks/02_difference_autoencoders" in (folder / "searchindex.js").read_text(encoding="utf-8")
 
 
 def test_a_notebook_that_runs_shows_its_figure_and_a_note_where_its_widget_stood(site):
-    page = (site[0] / "notebooks" / "small.html").read_text()
+    page = (site[0] / "notebooks" / "small.html").read_text(encoding="utf-8")
     assert 'alt="an empty square"' in page and "data:image/png;base64," in page
     assert "a widget that needs a running kernel" in page and "VBox(" not in page
 
 
 def test_formulas_come_from_the_site_itself(site):
-    page = (site[0] / "notebooks" / "small.html").read_text()
+    page = (site[0] / "notebooks" / "small.html").read_text(encoding="utf-8")
     assert "\\alpha_t" in page and "mathjax/tex-chtml.js" in page and "cdn." not in page
     assert (site[0] / "_static" / "mathjax" / "tex-chtml.js").exists()
     assert list((site[0] / "_static" / "mathjax").rglob("MathJax_Main-Regular.woff"))

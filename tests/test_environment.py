@@ -47,7 +47,9 @@ def test_the_command_prints_one_line_for_each_check_and_succeeds():
 
 
 def test_a_library_that_does_not_load_is_a_red_line_and_the_rest_is_still_checked(tmp_path):
-    (tmp_path / "torch.py").write_text("raise OSError('libgomp.so.1: cannot open “shared” object file')")
+    (tmp_path / "torch.py").write_text(
+        "raise OSError('libgomp.so.1: cannot open “shared” object file')", encoding="utf-8"
+    )
     process = check_in_a_process(PYTHONPATH=str(tmp_path), PYTHONIOENCODING="ascii")  # a console without such letters
     assert process.returncode == 1 and process.stderr == ""
     lines = process.stdout.splitlines()

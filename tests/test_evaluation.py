@@ -127,6 +127,22 @@ def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straigh
         assert evaluate(*chosen, unfinished=file)["episodes"] == fast["episodes"] and done[-1] == 2
 
 
+def test_the_command_goes_on_with_the_tracks_that_are_left(straight_run, tmp_path, monkeypatch):
+    run, asked = shutil.copytree(straight_run, tmp_path / "run"), []
+
+    def stop_after_one(executor, function, tasks):
+        asked.append([task[3] for task in tasks])
+        yield 0, (np.array([5.0]), np.array([7]))
+        if len(tasks) > 1:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr("stad_lab.evaluation.run_tasks", stop_after_one)
+    command = ["evaluate", "--variant", "input_output", "--path", str(run), "--episodes", "2"]
+    assert [main(command), main(command)] == [130, 0]
+    assert asked == [[[0], [1]], [[1]]]
+    assert not list(run.glob("unfinished*"))
+
+
 def test_the_screen_shows_what_the_summary_says(fast):
     text = describe(fast)
     for number in (fast["mean"], fast["standard_deviation"], *fast["interval"]):

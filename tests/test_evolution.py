@@ -56,7 +56,7 @@ def without_evolution(run, folder):
 
 def read(folder):
     """The log in a folder."""
-    return json.loads((folder / "evolution.json").read_text())
+    return json.loads((folder / "evolution.json").read_text(encoding="utf-8"))
 
 
 @pytest.fixture(scope="module")
@@ -427,7 +427,7 @@ def test_a_log_that_was_changed_is_refused(first_part, tmp_path):
 def test_a_damaged_log_is_refused(first_part, tmp_path):
     folder = shutil.copytree(first_part, tmp_path / "run")
     log = folder / "evolution.json"
-    log.write_text(log.read_text()[:-200])
+    log.write_text(log.read_text(encoding="utf-8")[:-200])
     with pytest.raises(ValueError, match=r"evolution.json is damaged .*: delete it"):
         evolve("input_output", settings(), folder)
 

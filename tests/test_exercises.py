@@ -20,7 +20,9 @@ NOTEBOOKS = [*SOURCES.values(), *(COURSE / f"{name}.ipynb" for name in NAMES)]
 
 def read_cells(path):
     """The cells of a notebook, their sources joined."""
-    return [cell | {"source": "".join(cell["source"])} for cell in json.loads(path.read_text())["cells"]]
+    return [
+        cell | {"source": "".join(cell["source"])} for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]
+    ]
 
 
 def grading(cell):
@@ -43,7 +45,10 @@ GRADED = [pytest.param(name, marks=[] if name[:2] == "01" else pytest.mark.long)
 
 @pytest.fixture(scope="module")
 def graded(request, generator, tmp_path_factory):
-    """An assignment made, handed in as its solution and as its empty stub, and graded: (folder of the course, name)."""
+    """An assignment made, handed in as its solution and as its empty stub, and graded: (folder of the course, name).
+
+    The student with the stub has copied every cell that is to be answered, with the metadata, as JupyterLab does.
+    """
     name, root = request.param, tmp_path_factory.mktemp("course")
     shutil.copytree(SOURCES[name].parent, root / "source" / name)
     shutil.copy(COURSE / "nbgrader_config.py", root)
@@ -52,9 +57,22 @@ def graded(request, generator, tmp_path_factory):
     assert made["success"], made["log"]
     for student, work in {"solution": "source", "stub": "release"}.items():
         shutil.copytree(root / work / name, root / "submitted" / student / name)
+        if student == "stub":
+            copy_answers(root / "submitted" / student / name / f"{name}.ipynb")
         marked = course.autograde(name, student)
         assert marked["success"], marked["log"]
     return root, name
+
+
+def copy_answers(path):
+    """Write every cell of a notebook that is to be answered twice."""
+    notebook, cells = nbformat.read(path, 4), []
+    for cell in notebook.cells:
+        cells.append(cell)
+        if grading(cell)["solution"]:
+            cells.append(nbformat.from_dict(cell | {"id": f"{cell.id}-copy"}))
+    notebook.cells = cells
+    nbformat.write(notebook, path)
 
 
 def open_gradebook(root):
@@ -94,8 +112,30 @@ def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(graded
     monkeypatch.chdir(root)
     monkeypatch.setattr("sys.argv", ["marks.py", name])
     runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
-    told = ["student,machine,person,mark", f"solution,{machine:.1f},0.0,{machine / 2}", "stub,0.0,1.5,1.5"]
-    assert capsys.readouterr().out.splitlines() == told
+    unread = sum(cell["solution"] for cell in points.values())
+    told = [f"solution,{machine:.1f},0.0,{machine / 2},{unread}", "stub,0.0,1.5,1.5,0"]
+    assert capsys.readouterr().out.splitlines() == ["student,machine,person,mark,unread", *told]
+
+
+@pytest.mark.parametrize("graded", GRADED, indirect=True)
+def test_the_marks_of_an_unknown_assignment_end_in_one_line(graded, tmp_path, monkeypatch):
+    root, name = graded
+    unknown = f"no assignment '01' in gradebook.db: choose one of {name}"
+    for folder, asked, told in ((root, "01", unknown), (tmp_path, name, "no gradebook.db in .*: go to the folder")):
+        monkeypatch.chdir(folder)
+        monkeypatch.setattr("sys.argv", ["marks.py", asked])
+        with pytest.raises(SystemExit, match=told):
+            runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("graded", GRADED, indirect=True)
+def test_a_cell_that_a_student_has_copied_is_graded_once_and_stops_no_grading(graded):
+    root, name = graded
+    cells = read_cells(root / "autograded" / "stub" / name / f"{name}.ipynb")
+    ids = [grading(cell)["grade_id"] for cell in cells if "nbgrader" in cell["metadata"]]
+    answers = [cell for cell in read_cells(SOURCES[name]) if grading(cell)["solution"]]
+    assert len(ids) == len(set(ids)) and len(cells) == len(read_cells(SOURCES[name])) + len(answers)
 
 
 def test_a_warning_or_a_progress_bar_under_a_check_costs_no_points():
@@ -122,7 +162,7 @@ def test_a_warning_or_a_progress_bar_under_a_check_costs_no_points():
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
 def test_every_cell_of_the_solution_runs(graded):
     root, name = graded
-    notebook = json.loads((root / "autograded" / "solution" / name / f"{name}.ipynb").read_text())
+    notebook = json.loads((root / "autograded" / "solution" / name / f"{name}.ipynb").read_text(encoding="utf-8"))
     outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
     assert [output["evalue"] for output in outputs if output["output_type"] == "error"] == []
     pictures = [output["data"]["text/html"] for output in outputs if "text/html" in output.get("data", {})]
@@ -134,12 +174,14 @@ def test_the_student_versions_are_what_one_command_makes_of_the_sources(generato
     made = generator.generate(tmp_path)
     assert [path.stem for path in made] == NAMES
     for path in made:
-        assert path.read_text() == (COURSE / path.name).read_text(), "run notebooks/exercises/generate.py"
+        assert path.read_text(encoding="utf-8") == (COURSE / path.name).read_text(encoding="utf-8"), (
+            "run notebooks/exercises/generate.py"
+        )
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: f"{path.parent.name}/{path.stem}")
 def test_exercises_are_committed_clean(path):
-    text = path.read_text()
+    text = path.read_text(encoding="utf-8")
     notebook = json.loads(text)
     nbformat.validate(nbformat.from_dict(notebook))
     assert text == json.dumps(notebook, indent=1, ensure_ascii=False) + "\n"

@@ -1,21 +1,24 @@
 """Broken files, broken machines and impatient people: nothing is lost, nothing is used that is not whole."""
 
+import contextlib
 import dataclasses
 import errno
 import os
 import random
 import re
 import shutil
-import signal
 import stat
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
 
 import pytest
 from torch.optim.optimizer import register_optimizer_step_post_hook
+from worker_tasks import always_die, die_once, hang_once
 
 from stad_lab import evolution, pipeline
 from stad_lab.__main__ import main
@@ -32,7 +35,6 @@ from stad_lab.settings import Settings
 from stad_lab.table import RECORDS
 from stad_lab.verify import verify, verify_rollouts
 
-KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # on Windows, SIGTERM ends a process at once
 VARIANT, SETTINGS = "input_output", Settings.preset("quick")
 CHECKPOINTS = ("autoencoder.training.safetensors", "mdn_rnn.training.safetensors")
 
@@ -254,7 +256,7 @@ def kill_at_random(stage, run, tmp_path, kills):
         while before:  # every stage before it says that there is nothing to do
             line = process.stdout.readline()
             assert line, "the command ended before its stage began"
-            before -= line.endswith(b"nothing to do\n")
+            before -= line.rstrip().endswith(b"nothing to do")
         begin = time.perf_counter()
         try:
             process.wait(rng.uniform(0, duration))
@@ -302,27 +304,6 @@ def test_half_written_files_of_a_killed_process_are_cleared_away(quick_run, tmp_
 # Workers
 
 
-def die_once(marker, answer):
-    """A task whose first worker is killed."""
-    if not marker.exists():
-        marker.touch()
-        os.kill(os.getpid(), KILL)
-    return answer
-
-
-def hang_once(marker, answer):
-    """A task whose first worker never ends."""
-    if not marker.exists():
-        marker.touch()
-        time.sleep(10_000)
-    return answer
-
-
-def always_die():
-    """A task that no worker survives."""
-    os.kill(os.getpid(), KILL)
-
-
 def test_work_of_a_killed_worker_is_done_again(tmp_path, capfd):
     with worker_processes(2) as executor:
         tasks = [(tmp_path / "marker", number) for number in range(600)]  # many: it dies while others are handed in
@@ -353,9 +334,12 @@ def test_work_that_kills_every_worker_ends_in_an_error():
         list(run_tasks(executor, always_die, [()] * 300))
 
 
-def test_an_executor_that_never_answers_ends_in_an_error(tmp_path):
-    with ThreadPoolExecutor(1) as executor, pytest.raises(TaskError, match="nothing was heard of the workers for 1 "):
-        list(run_tasks(executor, time.sleep, [(1.5,)], time_limit=1))
+def test_an_executor_that_never_answers_ends_in_an_error():
+    never = threading.Event()
+    with ThreadPoolExecutor(1) as executor:
+        with pytest.raises(TaskError, match="nothing was heard of the workers for 1 "):
+            list(run_tasks(executor, never.wait, [()], time_limit=1))
+        never.set()
 
 
 def test_a_worker_killed_in_mid_generation_costs_nothing_but_time(quick_run, tmp_path):
@@ -402,7 +386,7 @@ def test_two_processes_do_not_share_a_run_folder(quick_run, tmp_path, capsys):
     holder = "import sys, time; from filelock import FileLock\n"  # as `locked` does, without its imports
     holder += "with FileLock(sys.argv[1] + '/.lock'): print('held', flush=True); time.sleep(1000)"
     process = subprocess.Popen([sys.executable, "-c", holder, folder], stdout=subprocess.PIPE)
-    assert process.stdout.readline() == b"held\n"
+    assert process.stdout.readline().strip() == b"held"
     before = snapshot(folder)
     assert main([*stage_command(folder, "mdn_rnn")[3:]]) == 2
     assert f"error: {folder} is in use by another process: wait until that has ended" in capsys.readouterr().err
@@ -456,6 +440,26 @@ def test_a_read_only_folder_is_refused_before_any_work(small_disk, quick_run, ca
     assert main([str(argument) for argument in evaluation]) == 2
     assert "evaluation.json could not be written (Read-only file system)" in capsys.readouterr().err
     assert time.perf_counter() - begin < 10  # not after the drive
+
+
+@pytest.mark.parametrize(("refusals", "patience", "found"), [(2, 1.0, b"new"), (10_000, 0.1, b"old")])
+def test_a_file_that_a_scanner_holds_for_a_moment_is_written_a_moment_later(
+    refusals, patience, found, tmp_path, monkeypatch
+):
+    file, replace, left = tmp_path / "file", Path.replace, [None] * refusals
+    write_bytes(file, b"old")
+
+    def refuse(path, target):
+        if left:
+            left.pop()
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return replace(path, target)
+
+    monkeypatch.setattr("stad_lab.checkpoints.PATIENCE", patience)
+    monkeypatch.setattr(Path, "replace", refuse)
+    with contextlib.nullcontext() if found == b"new" else pytest.raises(OSError, match="could not be written"):
+        write_bytes(file, b"new")
+    assert file.read_bytes() == found and list(tmp_path.iterdir()) == [file]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limit")

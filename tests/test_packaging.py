@@ -59,19 +59,19 @@ FILES = sorted(PACKAGE.glob("*.py"))
 
 def parse(file):
     """The syntax tree of a file."""
-    return ast.parse(file.read_text(), str(file))
+    return ast.parse(file.read_text(encoding="utf-8"), str(file))
 
 
 def test_environment_txt_and_pyproject_agree():
-    lines = [line.split("#")[0].strip() for line in (ROOT / "environment.txt").read_text().splitlines()]
+    lines = [line.split("#")[0].strip() for line in (ROOT / "environment.txt").read_text(encoding="utf-8").splitlines()]
     requirements = [line for line in lines if line]
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert requirements[-1] == "-e ."
     assert sorted(requirements[:-1]) == sorted(project["dependencies"])
 
 
 def test_every_requirement_is_bounded_and_box2d_py_is_not_among_them():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for requirement in project["dependencies"]:
         assert "==" in requirement or "<" in requirement
         assert not requirement.startswith("box2d")
@@ -231,7 +231,9 @@ def test_no_figure_is_lost_because_a_cell_goes_on_after_it_is_shown(file):
 
 
 def test_the_lab_is_opened_where_every_file_that_a_notebook_links_to_is_served():
-    (command,) = [line for line in (ROOT / "README.md").read_text().splitlines() if "jupyter lab" in line]
+    (command,) = [
+        line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines() if "jupyter lab" in line
+    ]
     places = [word for word in command.split("jupyter lab")[1].split() if not word.startswith("--")]
     # JupyterLab serves the folder that it is given, or the one where it is started.
     served = (ROOT / places[0] if places else ROOT).resolve()
@@ -244,9 +246,11 @@ def test_the_lab_is_opened_where_every_file_that_a_notebook_links_to_is_served()
 
 
 def test_ci_runs_the_one_test_command_of_the_readme():
-    commands = [line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("python3 ")]
+    commands = [
+        line for line in (ROOT / "README.md").read_text(encoding="utf-8").splitlines() if line.startswith("python3 ")
+    ]
     assert [command.split("&& .venv/bin/")[-1].split()[0] for command in commands] == ["jupyter", "pytest"]
     assert all(
         command.startswith("python3 -m venv .venv && .venv/bin/pip install -r environment.txt") for command in commands
     )
-    assert "grep -m 1 '^python3 .*pytest' README.md" in (ROOT / ".ci" / "run").read_text()
+    assert "grep -m 1 '^python3 .*pytest' README.md" in (ROOT / ".ci" / "run").read_text(encoding="utf-8")

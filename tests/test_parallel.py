@@ -9,6 +9,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+import psutil
 import pytest
 
 from stad_lab.evaluation import evaluate
@@ -20,7 +21,7 @@ from pathlib import Path
 from stad_lab.parallel import keep_freed_memory, return_freed_memory
 
 def held():
-    return int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0]) / 1e3
+    return int(Path("/proc/self/status").read_text(encoding="utf-8").split("VmRSS:")[1].split()[0]) / 1e3
 
 keep_freed_memory()
 begin = held()
@@ -95,6 +96,37 @@ if __name__ == "__main__":
         print("begun", flush=True)
         print(list(tasks))
 """
+
+
+ORPHAN = """
+import os, time
+from stad_lab.parallel import run_tasks, worker_processes
+
+if __name__ == "__main__":
+    with worker_processes(1) as executor:
+        print(next(run_tasks(executor, os.getpid, [()]))[1], flush=True)
+        time.sleep(1000)
+"""
+
+
+def lives(process):
+    """Whether a process of psutil still does anything."""
+    try:
+        return process.status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def test_workers_end_when_the_process_that_started_them_is_killed(tmp_path):
+    (tmp_path / "script.py").write_text(ORPHAN)
+    command = [sys.executable, "-W", "ignore", tmp_path / "script.py"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        worker = psutil.Process(int(process.stdout.readline()))
+        process.kill()
+    deadline = time.time() + 30
+    while lives(worker):
+        assert time.time() < deadline
+        time.sleep(0.05)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows suspends no process by a signal")

@@ -22,7 +22,7 @@ README = Path(__file__).parent.parent / "README.md"
 
 
 def read(agent, name):
-    return json.loads((PRETRAINED / agent / name).read_text())
+    return json.loads((PRETRAINED / agent / name).read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -77,7 +77,7 @@ def test_a_shipped_agent_drives(agent):
 @pytest.mark.parametrize("agent", AGENTS)
 def test_the_readme_reports_the_shipped_evaluation(agent):
     result = read(agent, "evaluation.json")
-    table = README.read_text().partition("| agent | all episodes |")[2]
+    table = README.read_text(encoding="utf-8").partition("| agent | all episodes |")[2]
     row = re.search(rf"^\| `{agent}` .*$", table, re.M).group()
     low, high = result["interval"]
     for figure in (f"{result['mean']:.1f}", f"{result['standard_deviation']:.1f}", f"{low:.1f} to {high:.1f}"):

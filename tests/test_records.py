@@ -39,21 +39,21 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "docs"))
 import tables
 
 RECORDS = Path(__file__).parent.parent / "stad_lab" / "records"
-README = (Path(__file__).parent.parent / "README.md").read_text()
+README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
 RESULTS, SPEED, LATENTS, CLUSTER = (
-    (Path(__file__).parent.parent / "docs" / f"{name}.md").read_text()
+    (Path(__file__).parent.parent / "docs" / f"{name}.md").read_text(encoding="utf-8")
     for name in ("results", "speed", "latents", "cluster")
 )
 STAGES = ("two_rounds", "finished")
 NOTEBOOK, LOST, DIFFERENCES = (
-    (Path(__file__).parent.parent / "notebooks" / name).read_text()
+    (Path(__file__).parent.parent / "notebooks" / name).read_text(encoding="utf-8")
     for name in ("05_replication.ipynb", "06_lost_points.ipynb", "02_difference_autoencoders.ipynb")
 )
 NUMBERS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 
 
 def read(name):
-    return json.loads((RECORDS / name).read_text())
+    return json.loads((RECORDS / name).read_text(encoding="utf-8"))
 
 
 def fast_drives(stage, variant):
@@ -429,7 +429,7 @@ def test_what_was_made_anew_on_another_machine_came_out_to_the_last_bit():
 
 
 def test_the_instructor_s_answers_are_those_of_the_records():
-    page = (Path(__file__).parent.parent / "docs" / "instructor.md").read_text()
+    page = (Path(__file__).parent.parent / "docs" / "instructor.md").read_text(encoding="utf-8")
     frame, shown = (official_returns([PRETRAINED / "second_round" / variant]) for variant in ("frame", "input"))
     intervals = [bootstrap(returns) for returns in (frame, shown, frame - shown)]
     alone = " and ".join(f"{low:.1f} to {high:.1f}" for low, high in intervals[:2])

@@ -15,7 +15,7 @@ from stad_lab.evaluation import bootstrap, evaluate
 from stad_lab.evolution import LOG, fitness_curves
 from stad_lab.pipeline import starts, total_budget
 from stad_lab.plots import plot_curves, plot_episodes, plot_intervals, plot_returns, plot_seeds, plot_stacks
-from stad_lab.replication import describe_time, keep, replicate, time_needed
+from stad_lab.replication import TRACKS, describe_time, keep, replicate, time_needed
 from stad_lab.rows import FLOORS, ROWS, Row
 from stad_lab.settings import Settings
 from stad_lab.table import (
@@ -414,3 +414,5 @@ def test_a_row_is_driven_on_the_official_tracks_with_gymnasium_s_renderer(tmp_pa
     call = inspect.signature(evaluate).bind(*asked[0][0], **asked[0][1])
     call.apply_defaults()
     assert [call.arguments[name] for name in ("episodes", "first_track", "fast")] == [replication.TRACKS, 0, False]
+    assert TRACKS == 100  # as it was before a fixture shortened it
+    assert call.arguments["unfinished"].parent == tmp_path  # so an interrupted evaluation goes on

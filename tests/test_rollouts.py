@@ -66,7 +66,7 @@ def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(how
     manifest = tmp_path / "run" / "rollouts" / "manifest.json"
     process = subprocess.Popen(collect_command(tmp_path / "run"), stderr=subprocess.PIPE, text=True)
     deadline = time.time() + 120
-    while not manifest.exists() or len(json.loads(manifest.read_text())["blocks"]) < 3:
+    while not manifest.exists() or len(json.loads(manifest.read_text(encoding="utf-8"))["blocks"]) < 3:
         assert time.time() < deadline
         time.sleep(0.005)
     process.send_signal(getattr(signal, how))
@@ -75,7 +75,7 @@ def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(how
         assert process.returncode == 130, error
         assert "the same command goes on" in error
         assert "Traceback" not in error
-    done = json.loads(manifest.read_text())["blocks"]
+    done = json.loads(manifest.read_text(encoding="utf-8"))["blocks"]
     assert 3 <= len(done) < MANY["episodes"]  # it was in the middle
     before = {path.name: path.stat().st_mtime_ns for path in manifest.parent.iterdir()}
     assert main(collect_command(tmp_path / "run")[3:]) == 0
@@ -83,7 +83,7 @@ def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(how
         for name in (f"{entry['index']:05d}.frames.npy", f"{entry['index']:05d}.actions.npy"):
             assert (manifest.parent / name).stat().st_mtime_ns == before[name]
     assert contents(manifest.parent) == contents(one_go)
-    assert len(json.loads(manifest.read_text())["blocks"]) == MANY["episodes"]
+    assert len(json.loads(manifest.read_text(encoding="utf-8"))["blocks"]) == MANY["episodes"]
 
 
 def test_a_complete_collection_is_left_alone(copied):
@@ -112,7 +112,7 @@ def test_what_another_process_collected_a_moment_ago_is_not_driven_again(tmp_pat
 
 def test_the_manifest_tells_settings_seeds_counts_and_checksums(quick_run):
     folder = quick_run / "rollouts"
-    manifest = json.loads((folder / "manifest.json").read_text())
+    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
     settings = Settings.preset("quick")
     assert {name: getattr(settings, name) for name in manifest["settings"]} == manifest["settings"]
     assert [entry["index"] for entry in manifest["blocks"]] == list(range(settings.episodes))
@@ -287,7 +287,7 @@ def test_one_flipped_bit_is_an_error_that_names_the_block(copied):
 
 def test_a_damaged_manifest_is_an_error_that_names_it(copied):
     manifest = copied / "manifest.json"
-    manifest.write_text(manifest.read_text()[:100])
+    manifest.write_text(manifest.read_text(encoding="utf-8")[:100])
     with pytest.raises(ValueError, match=r"manifest.json is damaged.*delete it and collect"):
         Rollouts(copied)
 
@@ -305,7 +305,7 @@ def test_rollouts_of_other_settings_are_refused(copied):
 
 
 def test_an_unfinished_collection_is_not_taken_for_a_dataset(copied):
-    manifest = json.loads((copied / "manifest.json").read_text())
+    manifest = json.loads((copied / "manifest.json").read_text(encoding="utf-8"))
     save_json(copied / "manifest.json", manifest | {"blocks": []})
     with pytest.raises(ValueError, match=r"\b0\b.*\b8\b.*collect"):
         Rollouts(copied)

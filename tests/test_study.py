@@ -12,6 +12,7 @@ from stad_lab.agent import PRETRAINED, read_world_model
 from stad_lab.autoencoder import VARIANTS, AutoEncoder
 from stad_lab.checkpoints import load_json
 from stad_lab.drives import MOTION, record_random_drive
+from stad_lab.mdn_rnn import fit_mdn_rnn
 from stad_lab.settings import Settings
 from stad_lab.study import (
     CONTENDERS,
@@ -50,7 +51,7 @@ def measured(quick_run, tmp_path_factory):
 
 
 def test_the_command_measures_m_against_simple_forecasts_and_lesser_m_s(measured):
-    result = json.loads((measured / "study.json").read_text())
+    result = json.loads((measured / "study.json").read_text(encoding="utf-8"))
     assert list(result["mdn_rnn"]["variants"]) == ["frame", "input"]
     nll = result["mdn_rnn"]["variants"]["input"]["nll"]
     assert set(CONTENDERS) < set(nll) and all(v["interval"][0] <= v["nats"] <= v["interval"][1] for v in nll.values())
@@ -80,6 +81,20 @@ def test_a_study_goes_on_where_it_stopped_with_the_same_numbers(measured, quick_
     assert not list(measured.glob("*/*.training.safetensors"))
 
 
+def test_the_m_without_actions_is_trained_without_them_and_no_other(quick_run, tmp_path, monkeypatch):
+    shown = {}
+
+    def fit(path, *given):
+        shown[path.parent.name] = np.concatenate(given[4])
+        return fit_mdn_rnn(path, *given)
+
+    monkeypatch.setattr("stad_lab.study.fit_mdn_rnn", fit)
+    world_model = read_world_model(PRETRAINED / "input", "input")
+    z, actions = np.zeros((4, 20, 32), np.float32), np.zeros((4, 20, 3), np.float32)
+    lesser_forecasts(Settings.preset("quick", m_steps=2), quick_run / "rollouts", tmp_path, world_model, z, actions)
+    assert [name for name, seen in shown.items() if not seen.any()] == ["no_actions"] and len(shown) == 3
+
+
 def test_every_stride_and_weight_of_the_kl_is_trained_and_measured(quick_run, tmp_path, monkeypatch):
     drives = twelve_drives()
     monkeypatch.setattr("stad_lab.study.random_drives", lambda *given: drives)
@@ -88,10 +103,13 @@ def test_every_stride_and_weight_of_the_kl_is_trained_and_measured(quick_run, tm
     monkeypatch.setattr("stad_lab.study.VARIANTS", ("frame",))
     monkeypatch.setattr("stad_lab.study.STRIDES", (1, 4))
     monkeypatch.setattr("stad_lab.study.KL_WEIGHTS", (0.25, 4.0))
-    found = study(Settings.preset("quick", v_steps=4), quick_run / "rollouts", tmp_path, ["probe", "autoencoder"])
+    parts = ["probe", "bar", "autoencoder"]
+    found = study(Settings.preset("quick", v_steps=4), quick_run / "rollouts", tmp_path, parts)
     for driver in ("random driver", "trained agent"):
         assert set(found["probe"]["variants"][driver]) == {"frame", "frame, untrained", "input_output, untrained"}
         assert set(found["probe"]["strides"][driver]) == {"1", "4"}
+        bar, probe = (found[part]["variants"][driver] for part in ("bar", "probe"))
+        assert bar.keys() == probe.keys() and bar["frame"] != probe["frame"]  # two V's, with the bar and without
     assert set(found["autoencoder"]["rate_distortion"]) == {"0.25", "4"}
     trained = {path.parent.name for path in tmp_path.glob("*/autoencoder.safetensors")}
     assert trained == {"stride_1", "stride_4", "kl_weight_4"}  # a stride of 4 and a weight of 0.25 are the same V

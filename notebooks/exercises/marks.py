@@ -1,26 +1,48 @@
 """Print the marks of an assignment that nbgrader has graded, as CSV: python marks.py 01_difference_images.
 
 Run it in the folder of the course, where nbgrader keeps its gradebook. The machine's points count half, because the
-checks and the model answers are public; the points that a person has given count in full.
+checks and the model answers are public; the points that a person has given count in full. A mark is final when `unread`
+is 0: so many answers of the student wait for a person.
 """
 
+import argparse
+import csv
 import sys
+from pathlib import Path
 
-from nbgrader.api import Gradebook
+from nbgrader.api import Gradebook, MissingEntry
 
 
-def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float]]:
-    """The points of an assignment: student -> (the machine's, a person's). A person's word replaces the machine's."""
+def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]]:
+    """The points of an assignment: student -> (the machine's, a person's, how many answers are unread).
+
+    A person's word replaces the machine's, and extra credit is a person's, too.
+    """
     found = {}
     for submission in gradebook.notebook_submissions(name, name):
         machine = sum(grade.auto_score or 0.0 for grade in submission.grades if grade.manual_score is None)
-        person = sum(grade.manual_score or 0.0 for grade in submission.grades)
-        found[submission.student.id] = machine, person
+        person = sum((grade.manual_score or 0.0) + (grade.extra_credit or 0.0) for grade in submission.grades)
+        found[submission.student.id] = machine, person, sum(grade.needs_manual_grade for grade in submission.grades)
     return found
 
 
-if __name__ == "__main__":
+def read_marks(name: str) -> dict[str, tuple[float, float, int]]:
+    """The marks in the gradebook of this folder. Ends the program if there is none, or no such assignment in it."""
+    if not Path("gradebook.db").exists():
+        sys.exit(f"no gradebook.db in {Path.cwd()}: go to the folder of the course, where nbgrader has graded")
     with Gradebook("sqlite:///gradebook.db") as gradebook:
-        print("student,machine,person,mark")
-        for student, (machine, person) in sorted(marks(gradebook, sys.argv[1]).items()):
-            print(student, machine, person, machine / 2 + person, sep=",")
+        try:
+            gradebook.find_assignment(name)
+        except MissingEntry:
+            known = ", ".join(assignment.name for assignment in gradebook.assignments)
+            sys.exit(f"no assignment {name!r} in gradebook.db: choose one of {known}")
+        return marks(gradebook, name)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description="Print the marks of an assignment that nbgrader has graded, as CSV.")
+    parser.add_argument("name", help="of the assignment, for example 01_difference_images")
+    table = csv.writer(sys.stdout, lineterminator="\n")
+    table.writerow(["student", "machine", "person", "mark", "unread"])
+    for student, (machine, person, unread) in sorted(read_marks(parser.parse_args().name).items()):
+        table.writerow([student, machine, person, machine / 2 + person, unread])
