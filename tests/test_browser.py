@@ -155,9 +155,9 @@ view_drive(drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.str
 
 
 SOURCE = """
-from stad_lab.frames import difference_image
+from stad_lab.frames import FrameMemory
 from stad_lab.widgets import show_source
-show_source(difference_image)
+show_source(FrameMemory)
 """
 LIGHTS = r"""pre => {
     const inked = Array.from(pre.querySelectorAll("span")).filter(part => part.textContent.trim())
