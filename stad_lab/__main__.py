@@ -273,9 +273,11 @@ def do_evaluate(options: argparse.Namespace) -> None:
     unfinished = file.with_name(f"unfinished-{file.name}")
     with drivers(options.scheduler) as executor:
         result = evaluate(*chosen, options.processes, executor, unfinished)
-    print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
-    save_json(file, result)
-    unfinished.unlink(missing_ok=True)
+    try:
+        print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
+    finally:  # or the pipe may have been closed, by `head`
+        save_json(file, result)
+        unfinished.unlink(missing_ok=True)
     print(f"  every episode: {file}")
 
 

@@ -1,5 +1,7 @@
 """Evaluation: official tracks, every episode on record, numbers that a script of one's own finds again."""
 
+import errno
+import io
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -141,6 +143,19 @@ def test_the_command_goes_on_with_the_tracks_that_are_left(straight_run, tmp_pat
     assert [main(command), main(command)] == [130, 0]
     assert asked == [[[0], [1]], [[1]]]
     assert not list(run.glob("unfinished*"))
+
+
+def test_an_evaluation_is_written_though_nobody_reads_what_is_printed(straight_run, tmp_path, monkeypatch):
+    class Closed(io.StringIO):
+        def write(self, text):
+            raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+    monkeypatch.setattr("stad_lab.evaluation.run_tasks", lambda *given: [(0, (np.array([5.0]), np.array([7])))])
+    monkeypatch.setattr("sys.stdout", Closed())
+    command = ["evaluate", "--variant", "input_output", "--path", str(straight_run), "--episodes", "1"]
+    assert main([*command, "--json", str(tmp_path / "evaluation.json")]) == 2
+    assert [file.name for file in tmp_path.iterdir()] == ["evaluation.json"]
+    assert load_json(tmp_path / "evaluation.json")["mean"] == 5.0
 
 
 def test_the_screen_shows_what_the_summary_says(fast):
