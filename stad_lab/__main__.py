@@ -72,18 +72,21 @@ def main(arguments: list[str] | None = None) -> int:
     except (ValueError, OSError, FloatingPointError, TaskError, BrokenProcessPool) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    except (MemoryError, OverflowError) as error:
-        print(f"error: too large for this machine: {error or type(error).__name__}", file=sys.stderr)
-        return 2
-    except RuntimeError as error:  # PyTorch's way of saying so, of its allocator for the CPU
-        if not isinstance(error, torch.OutOfMemoryError) and "allocate memory" not in str(error):
+    except (MemoryError, OverflowError, RuntimeError) as error:
+        if not is_too_large(error):
             raise
-        print(f"error: too large for this machine: {error}", file=sys.stderr)
+        print(f"error: too large for this machine: {error or type(error).__name__}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if options.resumes else ""
         print(f"\nstopped{again}", file=sys.stderr)
         return 130
+
+
+def is_too_large(error: Exception) -> bool:
+    """Whether an error says that memory is lacking: PyTorch's allocator for the CPU has no kind of error of its own."""
+    kinds = MemoryError, OverflowError, torch.OutOfMemoryError
+    return isinstance(error, kinds) or "allocate memory" in str(error)
 
 
 # What several commands share
@@ -133,15 +136,14 @@ def add_parts(command: argparse.ArgumentParser, parts: Iterable[str]) -> None:
 def read_changes(changes: list[str]) -> dict:
     """NAME=VALUE changes of settings as a dict. Raises ValueError for one that cannot be read."""
     kinds = {field.name: field.type for field in dataclasses.fields(Settings)}
+    readers = {str: str, float: float, bool: lambda text: json.loads(text.lower())}
     values = {}
     for change in changes:
         name, equals, text = change.partition("=")
         if not equals:
             raise ValueError(f"--set {change!r}: expected NAME=VALUE, for example stride=2")
         try:
-            kind = kinds.get(name, str)
-            read = {str: str, float: float, bool: lambda answer: json.loads(answer.lower())}.get(kind, json.loads)
-            values[name] = read(text)
+            values[name] = readers.get(kinds.get(name, str), json.loads)(text)
         except ValueError:
             hint = " (true or false)" if kinds.get(name) is bool else ""
             raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}{hint}") from None

@@ -76,20 +76,12 @@ class DreamEnv(gym.Env):
         latents = options.get("latents")
         if latents is None:
             latents = self.np_random.standard_normal(size)
-        latents = np.asarray(latents, np.float32)
-        if latents.shape != (size,) or not np.isfinite(latents).all():
-            finite = f"{np.isfinite(latents).sum()} of them finite"
-            raise ValueError(f"latents of shape {latents.shape}, {finite}: expected ({size},) finite numbers, V's z")
-        self.latents = torch.from_numpy(latents.copy())
+        self.latents = torch.tensor(np.asarray(latents, np.float32))
+        check_numbers("latents", self.latents, (size,), "V's z")
         zeros = torch.zeros(1, 1, self.mdn_rnn.hidden_size)
         self.state: State = options.get("state") or (zeros, zeros.clone())
         for part in self.state:
-            if part.shape != zeros.shape or not torch.isfinite(part).all():
-                finite = f"{torch.isfinite(part).sum()} of them finite"
-                raise ValueError(
-                    f"a memory of shape {tuple(part.shape)}, {finite}: expected {tuple(zeros.shape)} finite numbers,"
-                    " M's h and c of one car"
-                )
+            check_numbers("a memory", part, tuple(zeros.shape), "M's h and c of one car")
         self.prediction: Mixture | None = None
         self.frames = 0
         return self.latents.numpy().copy(), self._info()
@@ -129,6 +121,16 @@ class DreamEnv(gym.Env):
 
     def _info(self) -> dict:
         return {"hidden": self.state[0][0, 0].numpy().copy()}
+
+
+def check_numbers(name: str, found: torch.Tensor, shape: tuple[int, ...], meaning: str) -> None:
+    """Raise ValueError unless a tensor has this shape and its numbers are finite."""
+    finite = torch.isfinite(found)
+    if tuple(found.shape) != shape or not finite.all():
+        raise ValueError(
+            f"{name} of shape {tuple(found.shape)}, {finite.sum()} of them finite: expected {shape} finite numbers,"
+            f" {meaning}"
+        )
 
 
 @torch.no_grad()

@@ -80,10 +80,11 @@ def fit(
         progress = tqdm(read_ahead(batch, range(start, steps)), label, steps, initial=start, unit="step")
         for step, present in progress:
             found = losses(*present)
-            check_loss(found["total"].item(), label, step)
+            values = {name: loss.item() for name, loss in found.items()}
+            check_loss(values["total"], label, step)
             update(model, optimizer, found["total"], learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps)))
-            for name, loss in found.items():
-                sums[name] = sums.get(name, 0.0) + loss.item()
+            for name, value in values.items():
+                sums[name] = sums.get(name, 0.0) + value
             if (step + 1) % every == 0 or step + 1 == steps:
                 count = step + 1 - (history[-1]["step"] if history else 0)
                 means = {name: total / count for name, total in sums.items()}
@@ -91,7 +92,7 @@ def fit(
                 check_loss(heldout["total"], label, step)  # after the last update no other would tell
                 history.append({"step": step + 1, "train": means, "heldout": heldout})
                 sums = {}
-                progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
+                progress.set_postfix(heldout=f"{heldout['total']:.4g}")
                 save_state(checkpoint, model, optimizer, history, identity)
                 if watch:
                     watch(history)

@@ -177,7 +177,7 @@ def drive_again(folder: Path, variant: str, settings: Settings, executor: Execut
         return f"none: {NOT_HERE}"
     parameters, _ = load_controller(folder / CONTROLLER, variant)
     evaluations = [load_json(file) for file in sorted(folder.glob("evaluation*.json"))]
-    if not evaluations and not (folder / LOG).exists():
+    if not evaluations and lacks(folder, LOG):
         return f"none: {NOT_HERE}"
     evaluations.sort(key=lambda evaluation: evaluation["renderer"] != "official")
     with worker_processes(settings.processes, executor) as executor:

@@ -26,6 +26,8 @@ from stad_lab.mdn_rnn import MDNRNN, save_mdn_rnn
 from stad_lab.pipeline import command_of
 from stad_lab.settings import PRESETS, Settings
 
+ROOT = Path(__file__).parent.parent
+
 
 @pytest.fixture
 def run(quick_run, tmp_path):
@@ -229,8 +231,7 @@ def test_a_number_may_be_written_as_people_write_it():
 
 
 def test_every_command_line_of_the_pages_is_one():
-    root = Path(__file__).parent.parent
-    pages = [page.read_text(encoding="utf-8") for page in (root / "README.md", *(root / "docs").glob("*.md"))]
+    pages = [page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]
     blocks = [block for page in pages for block in re.findall(r"^```sh\n(.*?)^```", page, re.M | re.S)]
     lines = [line for block in blocks for line in re.findall(r"^\S*python -m stad_lab (.*)$", block, re.M)]
     for line in lines:
@@ -239,7 +240,7 @@ def test_every_command_line_of_the_pages_is_one():
 
 
 def test_the_script_of_the_readme_runs():
-    readme = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"^```python\n(.*?)^```", readme, re.M | re.S)
     whole = '"CarRacing-v3")'
     assert block.count(whole) == 1

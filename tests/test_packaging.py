@@ -212,14 +212,14 @@ def names_in(source):
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)
-def test_a_cell_that_runs_again_finds_what_it_read_at_first_whatever_ran_after_it(file):
+def test_a_cell_that_runs_again_finds_what_it_read_at_first_whatever_ran_since(file):
     cells = json.loads(file.read_text(encoding="utf-8"))["cells"]
     sources = {cell["id"]: "".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"}
     names = {cell: names_in(re.sub(r"^%.*$", "", source, flags=re.M)) for cell, source in sources.items()}
     order = list(names)
     for place, cell in enumerate(order):
-        before, after = (set().union(*(names[one][1] for one in part)) for part in (order[:place], order[place + 1 :]))
-        assert sorted(names[cell][0] & before & after) == [], cell
+        before, then = (set().union(*(names[one][1] for one in part)) for part in (order[:place], order[place:]))
+        assert sorted(names[cell][0] & before & then) == [], cell
 
 
 @pytest.mark.parametrize("file", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda file: file.stem)

@@ -73,6 +73,11 @@ def returns_of(evaluation):
     return np.array([episode["return"] for episode in evaluation["episodes"]])
 
 
+def by_hundreds(curve):
+    """The means of a curve of the paper's recipe over each hundred of its six hundred generations."""
+    return curve.reshape(6, 100).mean(axis=1)
+
+
 def sharpest_bends(tracks):
     """Places of the ten tracks with the sharpest bends to the right, and of those to the left."""
     env, bends = make_env(fast=True), []
@@ -575,10 +580,9 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
         [100, 74, 127],
     ]
     assert round(logs[stuck]["generations"][0]["sigma"] / logs[stuck]["generations"][-1]["sigma"]) == 34
-    hundreds = [curves[stuck][1][start : start + 100].mean() for start in range(0, 600, 100)]
-    assert max(hundreds) < 0 and official_returns([searches[stuck]]).max() < 800
+    means = {key: by_hundreds(average) for key, (_, average, _) in curves.items()}
+    assert max(means[stuck]) < 0 and official_returns([searches[stuck]]).max() < 800
     assert round(logs[slow]["generations"][0]["sigma"] / logs[slow]["generations"][-1]["sigma"]) == 22
-    means = {key: [curves[key][1][start : start + 100].mean() for start in range(0, 600, 100)] for key in searches}
     first, second, third, *_, last = (f"{points:.0f}" for points in means[slow])
     assert (
         f"have {first} points in the first hundred generations, {third} in the third and {last} in the last" in NOTEBOOK
@@ -587,7 +591,7 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
         f"they have {first} and {second} in the first two" in RESULTS
         and f"best, {third} points, in the third" in RESULTS
     )
-    assert "has {:.0f} and {:.0f} in those two hundreds".format(*np.array(means["frame", 2])[[2, 5]]) in NOTEBOOK
+    assert "has {:.0f} and {:.0f} in those two hundreds".format(*means["frame", 2][[2, 5]]) in NOTEBOOK
     assert max(means[slow]) == means[slow][2]
     assert all(np.less(means[key], means["frame", key[1]]).all() for key in (stuck, slow))  # "behind in every hundred"
     drives = load_json(searches[slow] / "evaluation.json")["episodes"]
@@ -625,7 +629,7 @@ def test_the_words_on_the_second_v_of_frame_hold_for_the_records():
     last = [learning_curve(folder)[1][-5:].mean() for folder in (own, *first, *found)]
     assert last[0] == sorted(last)[-3] > score  # "its search stays there"
     curves = [fitness_curves(load_json(folder / LOG)["generations"])[1] for folder in (own, *first, *found)]
-    hundreds = np.array([[curve[start : start + 100].mean() for start in range(0, 600, 100)] for curve in curves])
+    hundreds = np.array([by_hundreds(curve) for curve in curves])
     mine, six = [f"{mean:.0f}" for mean in hundreds[0]], hundreds[3:]
     assert f"have {', '.join(mine[:5])} and {mine[5]} points on average" in NOTEBOOK
     best = [others.index(("input_output", seed)) + 3 for seed in (0, 2)]  # the only ones above it at the end

@@ -34,9 +34,9 @@ def test_the_latent_explorer_has_a_slider_for_each_latent_and_redraws_in_less_th
     seconds = []
     for number in range(9):
         before = pictures[0].value
-        begin = time.thread_time()  # of this process alone, whatever else runs
+        begin = time.process_time()  # of this process alone, whatever else runs
         sliders[number].value = 3.0
-        seconds.append(time.thread_time() - begin)
+        seconds.append(time.process_time() - begin)
         assert pictures[0].value != before
     assert np.median(seconds) < 0.1
 
