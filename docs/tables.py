@@ -96,22 +96,22 @@ def variants_table(rows: dict[str, list[Path]]) -> str:
     return "\n".join(lines)
 
 
-def changes_table(rows: dict[str, list[Path]]) -> str:
-    """What every single change of `one_round` is worth."""
-    base = official_returns(rows["one_round"])
+def changes_table(rows: dict[str, list[Path]], base_name: str) -> str:
+    """What every single change of a row of one round is worth: of "one_round", or of "another_V"."""
+    base = official_returns(rows[base_name])
     laps = (base >= 900).mean(axis=1)
-    there = f"{laps.mean():.0%} there, {laps.min():.0%} to {laps.max():.0%} by search"
-    head = "difference to `one_round`", "what differs", "of the mean"
+    there = f"{laps.mean():.0%} there" + f", {laps.min():.0%} to {laps.max():.0%} by search" * (len(laps) > 1)
+    head = f"difference to `{base_name}`", "what differs", "of the mean"
     interval = "95% interval (of a single search: without its luck)"
     lines = [line(*head, interval, "of the median", f"complete laps ({there})"), "|---" * 6 + "|"]
     for name in [*ABLATIONS, "two_rounds_input"]:
-        if name in rows:
+        if name in rows and (ROWS[name].world or "one_round") == base_name:
             found = official_returns(rows[name])
             mean, median = found.mean() - base.mean(), np.median(found) - np.median(base)
             about = ROWS[name].about.removeprefix("one round, ")
             interval = "{:+.1f} to {:+.1f}".format(*bootstrap_gain(base, found))
             numbers = f"{mean:+.1f}", interval, f"{median:+.1f}", f"{(found >= 900).mean():.0%}"
-            lines.append(line(f"`{name}` less `one_round`", about, *numbers))
+            lines.append(line(f"`{name}` less `{base_name}`", about, *numbers))
     return "\n".join(lines)
 
 
@@ -133,7 +133,9 @@ def up_to_date(rows: dict[str, list[Path]], label: str) -> dict[Path, str]:
     missing = ", ".join(f"`{name}`" for name in ROWS if name not in rows)
     page = re.sub(r"Not made yet: [^.]*\.", f"Not made yet: {missing or 'none'}.", page)
     pages = {readme: page, results: results.read_text(encoding="utf-8")}
-    for table in (searches_table(rows), spread_table(rows), variants_table(rows), changes_table(rows)):
+    tables = [searches_table(rows), spread_table(rows), variants_table(rows)]
+    tables += [changes_table(rows, base) for base in ("one_round", "another_V") if base in rows]
+    for table in tables:
         pages[results] = put_table(pages[results], table)
     return pages
 
