@@ -779,9 +779,26 @@ def test_the_words_on_single_changes_hold_for_the_records():
     base, two_rounds = (official_returns(rows[name]) for name in ("one_round", "two_rounds_input"))
     searches = base.mean(axis=1)
     assert "Its three searches, on one V and M, have {:.1f}, {:.1f} and {:.1f}".format(*searches) in RESULTS
-    means = {name: official_returns(rows[name]).mean() for name in ABLATIONS if name in rows}
+    changes = [name for name in ABLATIONS if name in rows and ROWS[name].world != "another_V"]
+    means = {name: official_returns(rows[name]).mean() for name in changes}
     among = [name for name, mean in means.items() if searches.min() < mean < searches.max()]
     assert among == ["no_M", "no_z", "untrained_M", "stride_2", "stride_8"] and means["no_bar"] < searches.min()
+    again = official_returns(rows["another_V"])
+    told = float(again.mean()), round(base.mean() - again.mean()), round(searches.min() - again.mean())
+    assert (
+        "It has {:.1f}, {} points less than the mean of the three and {} less than the lowest".format(*told) in RESULTS
+    )
+    assert "ends at {:.0f}, {} points below the mean of the three and {} below the lowest".format(*told) in NOTEBOOK
+    assert (again < 800).sum() == 21 and sorted(means, key=means.get)[:2] == ["latent_16", "another_V"]
+    sigmas, scatter = {}, searches.std(ddof=1) * np.sqrt(2)
+    for name, luck in {"own_sigma": 2 / 3}.items():
+        lead, found = official_returns(rows[name]).mean() - again.mean(), official_returns(rows[name])
+        assert abs(2 * t.sf(abs(lead) / scatter, 2) - luck) < 0.04, name
+        assert f"ends at {found.mean():.0f}, {-lead:.0f} points below `another_V`" in NOTEBOOK, name
+    for name in ("another_V", "own_sigma"):
+        sigmas[name] = [one["sigma"] for one in load_json(rows[name][0] / LOG)["generations"]]
+    assert [round(found[-1], 2) for found in sigmas.values()] == [0.02, 0.1] and round(sigmas["own_sigma"][0], 1) == 0.1
+    assert 0.18 < 2 * t.sf(80 / scatter, 2) < 0.22  # "80 in one of five"
     few = official_returns(rows["few_agents"])
     assert round(float(base.mean() - few.mean())) == 51 and few.mean() < searches.min()
     assert [round(float(searches.min() - means[name])) for name in ("few_agents", "no_bar")] == [22, 28]
@@ -794,14 +811,15 @@ def test_the_words_on_single_changes_hold_for_the_records():
     assert round(float(narrow.mean())) == 760 and (narrow < 800).sum() == 40
     assert round(float(searches.min() - narrow.mean())) == 100 and (base < 800).sum(axis=1).tolist() == [13, 3, 9]
     luck = {name: float(ttest_ind(searches, official_returns(rows[name]).mean(axis=1)).pvalue) for name in means}
-    told = {"few_agents": 4, "no_bar": 7, "latent_16": 16}  # in one case of so many
+    told = {"few_agents": 4, "another_V": 7, "no_bar": 7, "latent_16": 16}  # in one case of so many
     assert {name: round(1 / luck.pop(name)) for name in told} == told and min(luck.values()) > 1 / 3
-    rng = np.random.default_rng(0)  # ten searches beside the same three, all of one kind
-    three, ten = rng.standard_normal((20_000, 3, 1)), rng.standard_normal((20_000, 1, 10))
+    rng = np.random.default_rng(0)  # eleven searches beside the same three, all of one kind
+    three, eleven = rng.standard_normal((20_000, 3, 1)), rng.standard_normal((20_000, 1, 11))
     smallest = 2 * t.sf(
-        np.abs(ten - three.mean(axis=1, keepdims=True)) / three.std(axis=1, ddof=1, keepdims=True) * np.sqrt(3 / 4), 2
+        np.abs(eleven - three.mean(axis=1, keepdims=True)) / three.std(axis=1, ddof=1, keepdims=True) * np.sqrt(3 / 4),
+        2,
     ).min(axis=(1, 2))
-    assert len(means) == 10 and 0.18 < (smallest <= ttest_ind(searches, [means["latent_16"]]).pvalue).mean() < 0.23
+    assert len(means) == 11 and 0.18 < (smallest <= ttest_ind(searches, [means["latent_16"]]).pvalue).mean() < 0.23
     new_tracks = official_returns(rows["two_rounds_new_tracks"])
     low, high = bootstrap_gain(base, new_tracks)
     told = f"+{new_tracks.mean() - base.mean():.1f}, from {-low:.1f} below to {high:.1f} above"
