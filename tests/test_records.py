@@ -791,13 +791,18 @@ def test_the_words_on_single_changes_hold_for_the_records():
     assert "ends at {:.0f}, {} points below the mean of the three and {} below the lowest".format(*told) in NOTEBOOK
     assert (again < 800).sum() == 21 and sorted(means, key=means.get)[:2] == ["latent_16", "another_V"]
     sigmas, scatter = {}, searches.std(ddof=1) * np.sqrt(2)
-    for name, luck in {"own_sigma": 2 / 3}.items():
+    for name, luck in {"own_sigma": 2 / 3, "every_weight": 1 / 3}.items():
         lead, found = official_returns(rows[name]).mean() - again.mean(), official_returns(rows[name])
         assert abs(2 * t.sf(abs(lead) / scatter, 2) - luck) < 0.04, name
-        assert f"ends at {found.mean():.0f}, {-lead:.0f} points below `another_V`" in NOTEBOOK, name
+        where = "above" if lead > 0 else "below"
+        assert f"ends at {found.mean():.0f}, {abs(lead):.0f} points {where} `another_V`" in NOTEBOOK, name
+        assert re.search(rf"`{name}`(?: is)? {abs(lead):.0f} (?:points )?{where}", RESULTS), name
     for name in ("another_V", "own_sigma"):
         sigmas[name] = [one["sigma"] for one in load_json(rows[name][0] / LOG)["generations"]]
     assert [round(found[-1], 2) for found in sigmas.values()] == [0.02, 0.1] and round(sigmas["own_sigma"][0], 1) == 0.1
+    every = official_returns(rows["every_weight"])
+    assert [(one < 800).sum() for one in (every, again)] == [13, 21]
+    assert [(one >= 900).sum() for one in (every, again, official_returns(rows["own_sigma"]))] == [55, 70, 57]
     assert 0.18 < 2 * t.sf(80 / scatter, 2) < 0.22  # "80 in one of five"
     few = official_returns(rows["few_agents"])
     assert round(float(base.mean() - few.mean())) == 51 and few.mean() < searches.min()
