@@ -800,6 +800,17 @@ def test_the_words_on_single_changes_hold_for_the_records():
     for name in ("another_V", "own_sigma"):
         sigmas[name] = [one["sigma"] for one in load_json(rows[name][0] / LOG)["generations"]]
     assert [round(found[-1], 2) for found in sigmas.values()] == [0.02, 0.1] and round(sigmas["own_sigma"][0], 1) == 0.1
+    logs = [load_json(rows[name][0] / LOG)["generations"] for name in ("another_V", "last_mean")]
+    assert len({tuple(one["mean_checksum"] for one in log) for log in logs}) == 1  # "the very search"
+    taken = [load_json(rows[name][0] / LOG)["best"] for name in ("another_V", "last_mean")]
+    assert [(one["generation"], round(one["validation"])) for one in taken] == [(35, 910), (30, 908)]
+    last = official_returns(rows["last_mean"])
+    low, high = bootstrap_gain(again, last)
+    lead = last.mean() - again.mean()
+    where = f"{abs(lead):.0f} points {'above' if lead > 0 else 'below'}"
+    assert low > 0 and f"{where} ({low:.0f} to {high:.0f}, for the luck in the tracks)" in RESULTS
+    told = f"ends at {last.mean():.0f}, {where} `another_V`, with {(last < 800).sum()} failures in place of 21"
+    assert told in NOTEBOOK and f"the interval ({low:.0f} to {high:.0f}) holds" in NOTEBOOK
     every = official_returns(rows["every_weight"])
     assert [(one < 800).sum() for one in (every, again)] == [13, 21]
     assert [(one >= 900).sum() for one in (every, again, official_returns(rows["own_sigma"]))] == [55, 70, 57]
