@@ -134,7 +134,7 @@ def up_to_date(rows: dict[str, list[Path]], label: str) -> dict[Path, str]:
     page = re.sub(r"Not made yet: [^.]*\.", f"Not made yet: {missing or 'none'}.", page)
     pages = {readme: page, results: results.read_text(encoding="utf-8")}
     tables = [searches_table(rows), spread_table(rows), variants_table(rows)]
-    tables += [changes_table(rows, base) for base in ("one_round", "another_V") if base in rows]
+    tables += [changes_table(rows, base) for base in ("one_round", "another_V")]
     for table in tables:
         pages[results] = put_table(pages[results], table)
     return pages

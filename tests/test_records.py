@@ -524,7 +524,7 @@ def test_the_words_on_the_paper_s_recipe_hold_for_the_records():
     assert told in RESULTS
     low, high = bootstrap_gain(both[0][2:], official_returns([searches["input", 2]]))
     assert f"and {pairs['input', 2]} for `input` ({-low:.0f} behind to {high:.0f} ahead)" in RESULTS
-    assert "by {} points, which the luck".format(round(mean["input", 2] - mean["frame", 2])) in RESULTS
+    assert "by {} points, for which the luck".format(round(mean["input", 2] - mean["frame", 2])) in RESULTS
     again = official_returns([searches["input", 2]])
     assert f"It has {mean['input', 2]:.1f}, with {(again >= 900).sum()} complete laps of 100" in RESULTS
     luck = [ttest_ind(*(found.mean(axis=1) for found in both), equal_var=equal).pvalue for equal in (True, False)]
@@ -790,20 +790,20 @@ def test_the_words_on_single_changes_hold_for_the_records():
     )
     assert "ends at {:.0f}, {} points below the mean of the three and {} below the lowest".format(*told) in NOTEBOOK
     assert (again < 800).sum() == 21 and sorted(means, key=means.get)[:2] == ["latent_16", "another_V"]
-    sigmas, scatter = {}, searches.std(ddof=1) * np.sqrt(2)
+    scatter = searches.std(ddof=1) * np.sqrt(2)  # of the difference of two searches
     for name, luck in {"own_sigma": 2 / 3, "every_weight": 1 / 3}.items():
-        lead, found = official_returns(rows[name]).mean() - again.mean(), official_returns(rows[name])
+        found = official_returns(rows[name])
+        lead = found.mean() - again.mean()
         assert abs(2 * t.sf(abs(lead) / scatter, 2) - luck) < 0.04, name
         where = "above" if lead > 0 else "below"
         assert f"ends at {found.mean():.0f}, {abs(lead):.0f} points {where} `another_V`" in NOTEBOOK, name
         assert re.search(rf"`{name}`(?: is)? {abs(lead):.0f} (?:points )?{where}", RESULTS), name
-    for name in ("another_V", "own_sigma"):
-        sigmas[name] = [one["sigma"] for one in load_json(rows[name][0] / LOG)["generations"]]
-    assert [round(found[-1], 2) for found in sigmas.values()] == [0.02, 0.1] and round(sigmas["own_sigma"][0], 1) == 0.1
-    logs = [load_json(rows[name][0] / LOG)["generations"] for name in ("another_V", "last_mean")]
-    assert len({tuple(one["mean_checksum"] for one in log) for log in logs}) == 1  # "the very search"
-    taken = [load_json(rows[name][0] / LOG)["best"] for name in ("another_V", "last_mean")]
-    assert [(one["generation"], round(one["validation"])) for one in taken] == [(35, 910), (30, 908)]
+    logs = {name: load_json(rows[name][0] / LOG) for name in ("another_V", "last_mean", "own_sigma")}
+    planned, _, own = ([one["sigma"] for one in log["generations"]] for log in logs.values())
+    assert (round(planned[-1], 2), round(own[-1], 2), round(own[0], 1)) == (0.02, 0.1, 0.1)
+    same = [logs[name] for name in ("another_V", "last_mean")]
+    assert len({tuple(one["mean_checksum"] for one in log["generations"]) for log in same}) == 1  # "the very search"
+    assert [(log["best"]["generation"], round(log["best"]["validation"])) for log in same] == [(35, 910), (30, 908)]
     last = official_returns(rows["last_mean"])
     low, high = bootstrap_gain(again, last)
     lead = last.mean() - again.mean()
