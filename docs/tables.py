@@ -9,13 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from stad_lab.autoencoder import VARIANTS
-from stad_lab.checkpoints import load_json
-from stad_lab.evaluation import bootstrap
-from stad_lab.evolution import LOG
-from stad_lab.plots import plot_claims, to_png
-from stad_lab.rows import ABLATIONS, ROWS
-from stad_lab.table import (
+from stad_lab.evaluation.evaluate import bootstrap
+from stad_lab.io.files import load_json
+from stad_lab.models.vae import VARIANTS
+from stad_lab.replication.experiments import ABLATIONS, ROWS
+from stad_lab.replication.tables import (
     bootstrap_gain,
     claims_and_outcomes,
     describe_table,
@@ -24,6 +22,8 @@ from stad_lab.table import (
     official_returns,
     summarise_row,
 )
+from stad_lab.training.evolution import LOG
+from stad_lab.viz.plots import plot_claims, to_png
 
 ROOT = Path(__file__).parent.parent
 PICTURE = ROOT / "notebooks" / "pictures" / "claims.png"

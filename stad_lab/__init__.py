@@ -8,10 +8,10 @@ import importlib
 
 HOMES = {
     "Agent": "agent",
-    "Settings": "settings",
-    "check_environment": "environment",
+    "Settings": "config",
+    "check_environment": "doctor",
     "load_agent": "agent",
-    "make_env": "car_racing",
+    "make_env": "envs.car_racing",
 }
 __all__ = ["Agent", "Settings", "check_environment", "load_agent", "make_env"]
 

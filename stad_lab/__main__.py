@@ -13,7 +13,7 @@ from concurrent.futures import Executor
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-from stad_lab.environment import escape_foreign_letters, tell_environment
+from stad_lab.doctor import escape_foreign_letters, tell_environment
 
 if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports that a broken installation would fail
     escape_foreign_letters()
@@ -22,20 +22,20 @@ if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports t
 import torch
 
 from stad_lab.agent import load_agent, load_world_model, run_folder
-from stad_lab.autoencoder import VARIANTS, check_variant
 from stad_lab.benchmark import PARTS, benchmark
-from stad_lab.checkpoints import check_writable, save_json, write_bytes
-from stad_lab.evaluation import describe, evaluate
-from stad_lab.finish import FINISH, OPEN, finish, finish_settings
-from stad_lab.parallel import TaskError
-from stad_lab.pipeline import STAGES, ship, train
-from stad_lab.replication import describe_row, describe_time, keep, replicate, time_needed
-from stad_lab.rows import FLOORS, ROWS
-from stad_lab.settings import PRESETS, Settings
-from stad_lab.study import PARTS as STUDY_PARTS
-from stad_lab.study import PROBE_DRIVES, describe_probe, probe_run, study
-from stad_lab.table import RECORDS, claims_and_outcomes, describe_table, kept_rows
-from stad_lab.verify import verify
+from stad_lab.config import PRESETS, Settings
+from stad_lab.evaluation.evaluate import describe, evaluate
+from stad_lab.evaluation.verify import verify
+from stad_lab.io.files import check_writable, save_json, write_bytes
+from stad_lab.io.workers import TaskError
+from stad_lab.models.vae import VARIANTS, check_variant
+from stad_lab.replication.experiments import FLOORS, ROWS
+from stad_lab.replication.run import describe_row, describe_time, keep, replicate, time_needed
+from stad_lab.replication.study import PARTS as STUDY_PARTS
+from stad_lab.replication.study import PROBE_DRIVES, describe_probe, probe_run, study
+from stad_lab.replication.tables import RECORDS, claims_and_outcomes, describe_table, kept_rows
+from stad_lab.training.fine_tuning import FINISH, OPEN, finish, finish_settings
+from stad_lab.training.pipeline import STAGES, ship, train
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -156,7 +156,7 @@ def drivers(scheduler: str | None) -> Iterator[Executor | None]:
     if scheduler is None:
         yield None
     else:
-        from stad_lab.cluster import cluster  # Dask takes a second to import, and few need it
+        from stad_lab.io.dask_cluster import cluster  # Dask takes a second to import, and few need it
 
         with cluster(scheduler) as executor:
             yield executor
@@ -360,7 +360,7 @@ def do_table(options: argparse.Namespace) -> None:
         check_writable(options.picture)
     print(describe_table(rows))
     if options.picture:
-        from stad_lab.plots import plot_claims, to_png  # matplotlib takes a second, and workers import this file
+        from stad_lab.viz.plots import plot_claims, to_png  # matplotlib takes a second, and workers import this file
 
         figure = plot_claims(claims_and_outcomes(rows))
         write_bytes(options.picture, to_png(figure))
@@ -479,7 +479,7 @@ def add_film(commands: argparse._SubParsersAction) -> None:
 
 def do_film(options: argparse.Namespace) -> None:
     """Drive, and write the picture."""
-    from stad_lab.film import film_agent, film_viewer  # matplotlib takes a second, and workers import this file
+    from stad_lab.viz.video import film_agent, film_viewer  # matplotlib takes a second, and workers import this file
 
     agent = load_agent(options.variant, options.path)
     shown = (agent, options.track, options.first, options.frames)

@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from stad_lab.autoencoder import REMEDY, AutoEncoder, check_part, check_variant, load_autoencoder, to_pictures
-from stad_lab.car_racing import MAX_FRAMES, make_env
-from stad_lab.checkpoints import load_tensors, save_tensors
-from stad_lab.controller import check_parameters, control, parameter_count
-from stad_lab.frames import FrameMemory, to_frame
-from stad_lab.mdn_rnn import MDNRNN, State, check_partner, load_mdn_rnn
+from stad_lab.envs.car_racing import MAX_FRAMES, make_env
+from stad_lab.envs.frames import FrameMemory, to_frame
+from stad_lab.io.files import load_tensors, save_tensors
+from stad_lab.models.controller import check_parameters, control, parameter_count
+from stad_lab.models.mdn_rnn import MDNRNN, State, check_partner, load_mdn_rnn
+from stad_lab.models.vae import REMEDY, AutoEncoder, check_part, check_variant, load_autoencoder, to_pictures
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 CONTROLLER = "controller.safetensors"  # the file of C

@@ -33,18 +33,18 @@ from torch.utils.data import DataLoader, Dataset
 from tqdm.auto import tqdm
 
 from stad_lab.agent import PRETRAINED, Agent, drive, load_agent, read_world_model
-from stad_lab.autoencoder import AutoEncoder, autoencoder_losses, load_autoencoder, save_autoencoder, to_pictures
-from stad_lab.car_racing import BAR_TOP, HULL_COLUMN, HULL_ROW, MAX_FRAMES, make_env, place_car
-from stad_lab.checkpoints import save_json
-from stad_lab.controller import control, initial_parameters
-from stad_lab.evolution import drive_group, drive_parallel, hand_out, make_strategy
-from stad_lab.frames import OBSERVATION_SHAPE, FrameMemory, to_frame
-from stad_lab.mdn_rnn import MDNRNN, mdn_loss, save_mdn_rnn
-from stad_lab.parallel import keep_freed_memory, run_in_order, worker_processes
-from stad_lab.pipeline import provenance
-from stad_lab.rollouts import RandomDriver, Rollouts, collect_rollouts, track_seeds
-from stad_lab.settings import Settings
-from stad_lab.training import read_ahead
+from stad_lab.config import Settings
+from stad_lab.envs.car_racing import BAR_TOP, HULL_COLUMN, HULL_ROW, MAX_FRAMES, make_env, place_car
+from stad_lab.envs.frames import OBSERVATION_SHAPE, FrameMemory, to_frame
+from stad_lab.io.files import save_json
+from stad_lab.io.workers import keep_freed_memory, run_in_order, worker_processes
+from stad_lab.models.controller import control, initial_parameters
+from stad_lab.models.mdn_rnn import MDNRNN, mdn_loss, save_mdn_rnn
+from stad_lab.models.vae import AutoEncoder, autoencoder_losses, load_autoencoder, save_autoencoder, to_pictures
+from stad_lab.training.dataset import RandomDriver, Rollouts, collect_rollouts, track_seeds
+from stad_lab.training.evolution import drive_group, drive_parallel, hand_out, make_strategy
+from stad_lab.training.pipeline import provenance
+from stad_lab.training.trainer import read_ahead
 
 V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, and how many of them are not timed
 VARIANT = "input"  # of the shipped agent that drives
@@ -470,7 +470,7 @@ def measure_cluster(rounds: int) -> dict:
     from distributed import LocalCluster  # Dask takes a second to import, and few need it
     from distributed.protocol.pickle import dumps
 
-    from stad_lab.cluster import cluster
+    from stad_lab.io.dask_cluster import cluster
 
     settings = Settings.preset("laptop", population=16, tracks=4, max_frames=100, patience=0)
     agent = load_agent(VARIANT)

@@ -25,11 +25,11 @@ from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from stad_lab import load_agent, make_env
 from stad_lab.agent import drive, load_controller
-from stad_lab.car_racing import FastCarRacing
-from stad_lab.checkpoints import save_tensors
-from stad_lab.controller import initial_parameters
-from stad_lab.evaluation import evaluate
-from stad_lab.settings import Settings
+from stad_lab.config import Settings
+from stad_lab.envs.car_racing import FastCarRacing
+from stad_lab.evaluation.evaluate import evaluate
+from stad_lab.io.files import save_tensors
+from stad_lab.models.controller import initial_parameters
 
 torch.set_num_threads(1)  # the models here are tiny: more threads would only get in each other's way
 
@@ -169,9 +169,11 @@ def evaluate_briefly():
     """evaluate_briefly(patch): a row of the table is evaluated on one track, with the fast renderer, for 60 frames."""
 
     def shorten(patch):
-        patch.setattr("stad_lab.replication.TRACKS", 1)
-        patch.setattr("stad_lab.replication.evaluate", functools.partial(evaluate, fast=True))
-        patch.setattr("stad_lab.evolution.drive", functools.partial(drive, max_frames=60))  # a search says its own
+        patch.setattr("stad_lab.replication.run.TRACKS", 1)
+        patch.setattr("stad_lab.replication.run.evaluate", functools.partial(evaluate, fast=True))
+        patch.setattr(
+            "stad_lab.training.evolution.drive", functools.partial(drive, max_frames=60)
+        )  # a search says its own
 
     return shorten
 

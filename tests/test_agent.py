@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from stad_lab import Agent, load_agent, make_env, mdn_rnn
+from stad_lab import Agent, load_agent, make_env
 from stad_lab.agent import (
     PRETRAINED,
     drive,
@@ -21,15 +21,16 @@ from stad_lab.agent import (
     run_folder,
     save_controller,
 )
-from stad_lab.autoencoder import VARIANTS, AutoEncoder, load_autoencoder
-from stad_lab.car_racing import FastCarRacing
-from stad_lab.controller import initial_parameters, parameter_count
-from stad_lab.frames import to_frame
-from stad_lab.mdn_rnn import MDNRNN, encode_frames
-from stad_lab.pipeline import ship, train
-from stad_lab.rollouts import Rollouts
-from stad_lab.search_space import features
-from stad_lab.settings import Settings
+from stad_lab.config import Settings
+from stad_lab.envs.car_racing import FastCarRacing
+from stad_lab.envs.frames import to_frame
+from stad_lab.models import mdn_rnn
+from stad_lab.models.controller import initial_parameters, parameter_count
+from stad_lab.models.mdn_rnn import MDNRNN, encode_frames
+from stad_lab.models.vae import VARIANTS, AutoEncoder, load_autoencoder
+from stad_lab.training.dataset import Rollouts
+from stad_lab.training.pipeline import ship, train
+from stad_lab.training.subspace import features
 
 
 def make_agent(variant="input_output", cars=None, stride=4, crop_bar=True):

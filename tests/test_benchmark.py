@@ -24,9 +24,9 @@ from stad_lab.benchmark import (
     train_m,
     train_v,
 )
-from stad_lab.checkpoints import load_json
-from stad_lab.rollouts import collect_rollouts
-from stad_lab.settings import Settings
+from stad_lab.config import Settings
+from stad_lab.io.files import load_json
+from stad_lab.training.dataset import collect_rollouts
 
 
 def test_contenders_take_turns_in_alternating_order():

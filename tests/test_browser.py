@@ -136,9 +136,9 @@ SLIDERS = (
     """
 import numpy as np
 from stad_lab import load_agent
-from stad_lab.drives import look_inside, record_drive
-from stad_lab.plots import plot_curves
-from stad_lab.widgets import explore, explore_latents, slider, view_drive
+from stad_lab.evaluation.trajectories import look_inside, record_drive
+from stad_lab.viz.plots import plot_curves
+from stad_lab.viz.widgets import explore, explore_latents, slider, view_drive
 def draw(bend):
     return plot_curves({"line": np.sin(bend * np.arange(20.0))}, f"bend {bend}", "x", "y")
 explore(draw, bend=slider(0.0, 1.0, 0.5, "bend"))
@@ -155,8 +155,8 @@ view_drive(drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.str
 
 
 SOURCE = """
-from stad_lab.frames import FrameMemory
-from stad_lab.widgets import show_source
+from stad_lab.envs.frames import FrameMemory
+from stad_lab.viz.widgets import show_source
 show_source(FrameMemory)
 """
 LIGHTS = r"""pre => {
@@ -186,8 +186,8 @@ def test_source_code_can_be_read_in_the_dark_theme_and_a_moved_slider_draws_anot
 
 SEAT = """
 from stad_lab import load_agent
-from stad_lab.play import Session
-from stad_lab.play_widget import drive_yourself
+from stad_lab.play.session import Session
+from stad_lab.play.widget import drive_yourself
 session = Session(load_agent("input"), track=1)
 drive_yourself(session)
 """
@@ -248,9 +248,9 @@ import shutil, tempfile
 from pathlib import Path
 from stad_lab import Settings
 from stad_lab.agent import PRETRAINED
-from stad_lab.evolution import evolve, fitness_curves
-from stad_lab.plots import plot_evolution
-from stad_lab.widgets import watch_training
+from stad_lab.training.evolution import evolve, fitness_curves
+from stad_lab.viz.plots import plot_evolution
+from stad_lab.viz.widgets import watch_training
 if "folder" not in globals():
     folder = Path(tempfile.mkdtemp())
     for name in ("autoencoder.safetensors", "mdn_rnn.safetensors"):

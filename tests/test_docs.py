@@ -17,7 +17,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from stad_lab.widgets import show
+from stad_lab.viz.widgets import show
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
@@ -25,7 +25,7 @@ import gallery  # noqa: E402
 from site_check import faults  # noqa: E402
 
 CELLS = (
-    "from matplotlib.figure import Figure\nfrom stad_lab.widgets import explore, show, slider\n"
+    "from matplotlib.figure import Figure\nfrom stad_lab.viz.widgets import explore, show, slider\n"
     "figure = Figure(figsize=(1, 1))\nfigure.set_label('an empty square')\nshow(figure)",
     "explore(lambda x: figure, x=slider(0, 1, 0, 'x'))",
 )

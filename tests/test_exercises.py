@@ -215,7 +215,7 @@ def moments():
     """Assignment and check -> the names that are defined right before it, if all before is solved."""
     found = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stad_lab.widgets.show", lambda figure: figure)
+        patch.setattr("stad_lab.viz.widgets.show", lambda figure: figure)
         patch.setattr("sys.stderr", sys.stderr)  # the notebooks set it
         for name in NAMES:
             names = {}

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from stad_lab.agent import PRETRAINED, drive, load_agent
-from stad_lab.autoencoder import VARIANTS, load_autoencoder
-from stad_lab.checkpoints import checksum
-from stad_lab.evaluation import summarise
-from stad_lab.evolution import fitness_curves
-from stad_lab.mdn_rnn import load_mdn_rnn
-from stad_lab.rollouts import TRACK_RANGES, track_seeds
-from stad_lab.settings import Settings
+from stad_lab.config import Settings
+from stad_lab.evaluation.evaluate import summarise
+from stad_lab.io.files import checksum
+from stad_lab.models.mdn_rnn import load_mdn_rnn
+from stad_lab.models.vae import VARIANTS, load_autoencoder
+from stad_lab.training.dataset import TRACK_RANGES, track_seeds
+from stad_lab.training.evolution import fitness_curves
 
 # An agent is named by its folder: `input`, or `second_round/input`.
 AGENTS = sorted(file.parent.relative_to(PRETRAINED).as_posix() for file in PRETRAINED.rglob("controller.safetensors"))

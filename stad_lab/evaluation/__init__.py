@@ -1,0 +1,1 @@
+"""How good V, M and the agent are."""

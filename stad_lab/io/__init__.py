@@ -1,0 +1,1 @@
+"""Files that survive, and who computes."""

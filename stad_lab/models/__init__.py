@@ -1,0 +1,1 @@
+"""V, M and C: the networks and their losses."""

@@ -1,0 +1,1 @@
+"""The experiments of the replication, and what came out."""

@@ -1,0 +1,1 @@
+"""How V, M and C are trained."""

@@ -1,0 +1,207 @@
+"""The dream is a Gymnasium environment that repeats itself for a seed and shows pictures."""
+
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from stad_lab.agent import Agent
+from stad_lab.envs.dream import DreamEnv, dream_on
+from stad_lab.evaluation.trajectories import record_drive
+from stad_lab.models.controller import control
+from stad_lab.viz.video import naps
+
+ACTION = np.array([0.1, 0.5, 0], np.float32)
+
+
+@pytest.fixture
+def dream(agent):
+    """A dream of the quick run."""
+    return DreamEnv(agent.autoencoder, agent.mdn_rnn, max_frames=20, render_mode="rgb_array")
+
+
+def dream_along(env, seed, frames=10, **options):
+    """The latents of one dream under a constant action, (frames + 1, latent_size)."""
+    latents = [env.reset(seed=seed, options=options)[0]]
+    latents += [env.step(ACTION)[0] for _ in range(frames)]
+    return np.array(latents)
+
+
+def test_check_env_passes(dream):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # z has no bounds, and no spec was registered
+        check_env(dream)
+
+
+def test_the_same_seed_gives_the_same_dream_and_another_seed_another_one(dream):
+    start = {"latents": np.zeros(32, np.float32)}  # so that the seed alone tells them apart
+    first, other = (dream_along(dream, seed=seed, **start) for seed in (1, 2))
+    assert np.array_equal(dream_along(dream, seed=1, **start), first)
+    assert not np.isclose(other[1:], first[1:]).all(axis=1).any()
+    assert np.isfinite(first).all()
+    assert not np.isclose(dream.reset(seed=1)[0], dream.reset(seed=2)[0]).all()  # nor do they begin alike
+
+
+def test_the_action_steers_the_dream(dream):
+    straight = dream_along(dream, seed=1)
+    dream.reset(seed=1)
+    turned = [dream.step(np.array([-1, 0, 1], np.float32))[0] for _ in range(10)]
+    assert not np.allclose(straight[1:], turned, atol=1e-4)
+
+
+def test_a_colder_dream_is_calmer(dream):
+    calm = []
+    for temperature in (0.01, 1.0):
+        dream.temperature = temperature
+        steps = dream_along(dream, seed=3, frames=19, latents=np.zeros(32, np.float32))
+        calm.append(np.abs(np.diff(steps[1:], axis=0)).mean())
+    assert calm[0] < 0.5 * calm[1]
+
+
+def test_a_dream_is_cut_after_max_frames_and_never_rewarded(dream):
+    dream.reset(seed=0)
+    steps = [dream.step(ACTION) for _ in range(20)]
+    assert [step[1:4] for step in steps] == [(0.0, False, False)] * 19 + [(0.0, False, True)]
+
+
+def test_a_dream_shows_pictures_of_its_latents(dream):
+    dream.reset(seed=0, options={"latents": np.zeros(32, np.float32)})
+    first = dream.render()
+    assert first.shape == (64, 64, 3)
+    assert first.dtype == np.uint8
+    dream.reset(seed=5, options={"latents": np.zeros(32, np.float32)})
+    assert np.array_equal(dream.render(), first)
+    dream.step(ACTION)
+    assert not np.array_equal(dream.render(), first)
+    dream.render_mode = None
+    assert dream.render() is None
+
+
+def test_a_dream_shows_the_memory_of_m(dream, agent):
+    _, info = dream.reset(seed=0)
+    assert info["hidden"].shape == (agent.mdn_rnn.hidden_size,)
+    assert not info["hidden"].any()
+    assert dream.step(ACTION)[4]["hidden"].any()
+
+
+@pytest.mark.parametrize("action", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]]])
+def test_an_action_that_is_not_three_finite_numbers_is_refused(action, dream):
+    dream.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action \[.*\]: expected three finite numbers, steering, gas and brake"):
+        dream.step(np.array(action, np.float32))
+
+
+def test_latents_that_do_not_fit_are_refused(dream):
+    with pytest.raises(ValueError, match=r"latents of shape \(5,\), 5 of them finite: expected \(32,\) finite numbers"):
+        dream.reset(options={"latents": np.zeros(5)})
+    with pytest.raises(ValueError, match=r"\(32,\), 0 of them finite: expected \(32,\) finite numbers"):
+        dream.reset(options={"latents": np.full(32, np.nan)})
+
+
+@pytest.mark.parametrize(("cars", "value"), [(3, 0.0), (1, np.nan)])
+def test_a_memory_that_does_not_fit_is_refused(cars, value, dream):
+    state = (torch.full((1, cars, dream.mdn_rnn.hidden_size), value),) * 2
+    with pytest.raises(ValueError, match=rf"a memory of shape \(1, {cars}, .*: expected \(1, 1, .*, M's h and c"):
+        dream.reset(options={"state": state})
+
+
+@pytest.mark.parametrize("temperature", [0, -1, 1e-40, float("nan")])
+def test_a_temperature_that_is_no_positive_number_is_refused(temperature, agent):
+    with pytest.raises(ValueError, match=f"temperature={temperature}: expected a .*number above 0"):
+        DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature)
+
+
+def test_another_render_mode_is_refused(agent):
+    with pytest.raises(ValueError, match="render_mode='human': a dream can be rendered as 'rgb_array' only"):
+        DreamEnv(agent.autoencoder, agent.mdn_rnn, render_mode="human")
+
+
+def test_a_step_before_reset_is_refused(dream):
+    with pytest.raises(RuntimeError, match="step before reset: call reset"):
+        dream.step(ACTION)
+
+
+def test_a_picture_before_reset_is_refused(agent):
+    with pytest.raises(RuntimeError, match="render before reset: call reset"):
+        DreamEnv(agent.autoencoder, agent.mdn_rnn, render_mode="rgb_array").render()
+
+
+def test_an_agent_dreams_on_without_being_changed(agent, observations):
+    for observation in observations[:10]:
+        agent.act(observation)
+    before = [part.clone() for part in agent.state], agent.latents.copy()
+    pictures, actions = dream_on(agent, 12, temperature=0.8, seed=3)
+    assert pictures.shape == (12, 64, 64, 3)
+    assert pictures.dtype == np.uint8
+    assert actions.shape == (12, 3)
+    assert actions.dtype == np.float32
+    assert len({picture.tobytes() for picture in pictures}) == 12  # something moves
+    assert all((was == now).all() for was, now in zip(before[0], agent.state, strict=True))
+    assert np.array_equal(before[1], agent.latents)
+    again = dream_on(agent, 12, temperature=0.8, seed=3)
+    assert np.array_equal(again[0], pictures)
+    assert np.array_equal(again[1], actions)
+    assert not np.array_equal(dream_on(agent, 12, temperature=0.8, seed=4)[0], pictures)
+
+
+@torch.no_grad()
+def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent, observations):
+    for observation in observations[:10]:
+        agent.act(observation)
+    pictures, actions = dream_on(agent, 4, temperature=1e-6)
+    state, mixture = agent.state, agent.mdn_rnn.mixture(agent.state[0])
+    for picture, action in zip(pictures, actions, strict=True):  # by hand, with the likeliest z of every step
+        z = mixture.mean.gather(-1, mixture.logpi.argmax(-1, keepdim=True))[0, 0, :, 0]
+        drawn = agent.autoencoder.decode(z[None])[0][0].permute(1, 2, 0).numpy()
+        assert np.abs(drawn - picture / 255).max() < 0.02
+        seen = np.concatenate([z.numpy(), state[0][0, 0].numpy()])
+        assert control(agent.parameters, seen[None])[0] == pytest.approx(action, abs=1e-2)
+        mixture, state = agent.mdn_rnn(z[None, None], torch.from_numpy(action)[None, None], state)
+    dream = DreamEnv(agent.autoencoder, agent.mdn_rnn, 1e-6)
+    latents, _ = dream.reset(options={"latents": z.numpy(), "state": state})
+    for _ in range(3):
+        latents, _, _, _, info = dream.step(action)
+        _, state = agent.mdn_rnn(z[None, None], torch.from_numpy(action)[None, None], state)
+        z = torch.from_numpy(latents)
+        assert info["hidden"] == pytest.approx(state[0][0, 0].numpy(), abs=1e-5)
+
+
+def test_an_agent_in_a_film_dreams_on_from_its_own_drive_and_is_woken_in_time(agent):
+    drive = record_drive(agent, track=np.int64(3), frames=25)
+    dreams = naps(agent, drive, first=6, length=8)
+    assert dreams.shape == (len(drive) - 6, 64, 64, 3)
+    for nap, moment in enumerate((6, 14, 22)):
+        agent.reset()
+        for observation in drive.observations[: moment + 1]:
+            action = agent.act(observation)
+        assert np.array_equal(action, drive.actions[moment])
+        length = min(8, len(drive) - moment)
+        dream, _ = dream_on(agent, length, seed=nap)
+        assert np.array_equal(dreams[moment - 6 :][:length], dream)
+
+
+def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
+    with pytest.raises(ValueError, match="has not acted yet: let it drive a few real frames, then dream on"):
+        dream_on(agent, 5)
+
+
+def test_a_dream_of_no_frame_is_refused(agent, observations):
+    agent.reset()
+    agent.act(observations[0])
+    with pytest.raises(ValueError, match="frames=0: expected at least 1"):
+        dream_on(agent, 0)
+
+
+def test_one_car_dreams_on_with_its_own_c_and_several_cannot(agent, observations):
+    rows = np.stack([agent.parameters, -agent.parameters])
+    many, alone = (Agent(agent.autoencoder, agent.mdn_rnn, c, agent.stride, agent.crop_bar) for c in (rows, rows[1]))
+    many.act_batch(observations[:2])
+    with pytest.raises(ValueError, match=r"drives 2 cars: expected one, so go on with agent\.keep"):
+        dream_on(many, 5)
+    many.keep(np.array([1]))
+    alone.act(observations[1])
+    assert np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-4)
+    alone.parameters = rows[0]
+    assert not np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-2)

@@ -1,0 +1,143 @@
+"""A session at the wheel: smooth keys, a seat for two, two worlds, and a recording that is a Drive."""
+
+import numpy as np
+import pytest
+import torch
+
+from stad_lab import load_agent
+from stad_lab.evaluation.trajectories import driven_path, record_drive, remember_drive
+from stad_lab.play.session import Hand, Session
+
+
+@pytest.fixture
+def session():
+    """A session with the agent that comes with stad_lab, on track 3."""
+    return Session(load_agent("input"), track=3)
+
+
+def drive(session, *script):
+    """Hold keys for some frames: ("gas left", 20), ..."""
+    for keys, frames in script:
+        session.hand.hold(*keys.split())
+        for _ in range(frames):
+            session.step()
+
+
+def test_a_held_key_moves_the_action_smoothly_and_a_released_one_lets_it_fall_back():
+    hand = Hand()
+    hand.hold("left", "gas")
+    actions = np.array([hand.act() for _ in range(40)])
+    assert np.all(np.diff(actions[:10, 0]) < 0) and np.abs(np.diff(actions, axis=0)).max() < 0.11
+    assert actions[-1] == pytest.approx([-1, 0.7, 0])
+    hand.hold()
+    assert [hand.act() for _ in range(20)][-1] == pytest.approx([0, 0, 0])
+    hand.hold("left", "right")
+    assert hand.act()[0] == 0
+
+
+def test_a_session_that_the_agent_drives_is_the_drive_that_the_agent_drives_alone(session):
+    session.give("agent")
+    drive(session, ("", 40))
+    alone = record_drive(load_agent("input"), track=3, frames=40)
+    for name in ("observations", "actions", "rewards", "motion"):
+        assert np.array_equal(getattr(session.drive(), name), getattr(alone, name))
+    assert not session.by_hand().any() and session.score == pytest.approx(alone.rewards.sum())
+
+
+def test_the_memory_is_told_what_the_hand_did(session):
+    seen = []
+    for _ in range(30):
+        seen.append(session.agent.latents[0])
+        drive(session, ("gas", 1))
+    assert session.by_hand().all()
+    done = np.concatenate([session.drive().actions, np.zeros((1, 3), np.float32)])
+    hidden = remember_drive(session.agent.mdn_rnn, np.array([*seen, session.agent.latents[0]]), done)
+    assert np.allclose(session.before[0][0, 0], hidden[-1], atol=1e-5)
+
+
+def test_the_dream_begins_with_the_frame_in_sight_and_the_real_car_waits_for_the_dreamer(session):
+    session.give("agent")
+    drive(session, ("", 20))
+    before, score = session.observation, session.score
+    session.enter("dream")
+    session.dream.temperature = 0.5
+    drive(session, ("", 15))
+    session.give("hand")
+    drive(session, ("brake", 5))
+    dreamt = session.dreamt()
+    assert np.array_equal(dreamt.latents[0], session.agent.latents[0])
+    assert dreamt.frames.shape == (20, 64, 64, 3) and dreamt.by_hand.tolist() == [False] * 15 + [True] * 5
+    assert session.picture().shape == (64, 64, 3) and session.score == score
+    session.enter("real")
+    assert np.array_equal(session.picture(), before) and len(session.drive()) == 20
+    drive(session, ("", 1))
+    assert len(session.drive()) == 21
+
+
+def test_a_hand_takes_over_from_the_agents_last_action_without_a_jerk(session):
+    session.give("agent")
+    drive(session, ("", 25))
+    session.give("hand")
+    drive(session, ("left", 3))
+    actions = session.drive().actions[24:]
+    assert np.abs(np.diff(actions, axis=0))[:, :2].max() < 0.17
+    assert session.by_hand().tolist() == [False] * 25 + [True] * 3
+
+
+def test_an_ended_episode_must_be_begun_anew_and_the_earlier_ones_are_kept(session):
+    drive(session, ("gas", 5))
+    session.begin(np.int64(4))
+    drive(session, ("", 7))
+    session.begin(5)
+    assert [(track, len(kept)) for track, kept in session.earlier] == [(3, 5), (4, 7)]
+    session.real_ended = True
+    with pytest.raises(RuntimeError, match="the episode has ended"):
+        session.step()
+    session.enter("dream")
+    assert not session.ended
+    session.step()
+
+
+def test_what_does_not_exist_is_refused(session):
+    with pytest.raises(ValueError, match="track=-1: expected a whole number from 0 to 999,999"):
+        session.begin(-1)
+    with pytest.raises(ValueError, match="driver 'dog': expected one of hand, agent"):
+        session.give("dog")
+    with pytest.raises(ValueError, match="world 'mars': expected one of real, dream"):
+        session.enter("mars")
+    with pytest.raises(ValueError, match="pedal 'clutch'"):
+        session.hand.hold("gas", "clutch")
+    with pytest.raises(ValueError, match="at least one frame"):
+        session.drive()
+    with pytest.raises(ValueError, match="nothing was driven in a dream"):
+        session.dreamt()
+
+
+def test_dead_reckoning_follows_the_car(session):
+    hull = session.env.unwrapped.car.hull
+    start, angle = np.array(hull.position), hull.angle
+    drive(session, ("gas", 60), ("left", 40))
+    hull = session.env.unwrapped.car.hull
+    moved = np.array(hull.position) - start
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    assert np.linalg.norm(driven_path(session.drive().motion)[-1] - turn @ moved) < 0.1 * np.linalg.norm(moved)
+
+
+def test_a_dream_begins_with_m_s_memory_from_before_the_frame_in_sight(session):
+    session.give("agent")
+    drive(session, ("", 12))
+    session.enter("dream")
+    assert session.hidden.any() and np.array_equal(session.hidden, session.agent.hidden[0])
+    session.step()
+    done, seen = (torch.from_numpy(part)[None] for part in (session.dreamt().actions, session.agent.latents))
+    with torch.no_grad():
+        after, _ = session.agent.mdn_rnn.remember(seen, done, session.before)
+    assert np.allclose(session.hidden, after[0, 0], atol=1e-5)
+
+
+def test_a_second_episode_is_driven_as_if_it_were_the_first(session):
+    session.give("agent")
+    drive(session, ("", 10))
+    session.begin(4)
+    drive(session, ("", 10))
+    assert np.array_equal(session.drive().actions, record_drive(load_agent("input"), track=4, frames=10).actions)

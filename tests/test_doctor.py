@@ -1,0 +1,188 @@
+"""The environment check: green where all is well, and a red line with its remedy, never a crash, where it is not."""
+
+import os
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from stad_lab import check_environment
+from stad_lab import doctor as environment
+from stad_lab.agent import PRETRAINED
+from stad_lab.training.trainer import training_device
+
+ROOT = Path(__file__).parent.parent
+
+
+def check_in_a_process(*options, **variables):
+    """`python -m stad_lab check` in a process of its own."""
+    command = [sys.executable, *options, "-m", "stad_lab", "check"]
+    return subprocess.run(
+        command, cwd=ROOT, env=os.environ | variables, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def line(report, name):
+    """The line of a report about `name`."""
+    return next(line for line in report.lines if line.name == name)
+
+
+def test_where_everything_is_installed_nothing_is_red(tmp_path):
+    report = check_environment(tmp_path)
+    assert report.ok, report
+    for name in ("Python", "torch", "gymnasium", "CarRacing, fast", "CarRacing, Gymnasium's", "working folder", "GPU"):
+        assert line(report, name).state == "green"
+    assert all(bool(line.remedy) == (line.state != "green") for line in report.lines)
+
+
+def test_the_command_prints_one_line_for_each_check_and_succeeds():
+    process = check_in_a_process()
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert {text.split()[0] for text in process.stdout.splitlines()[:-1]} - {"remedy:"} <= {"green", "amber"}
+    assert "everything needed is here" in process.stdout
+
+
+def test_a_library_that_does_not_load_is_a_red_line_and_the_rest_is_still_checked(tmp_path):
+    (tmp_path / "torch.py").write_text(
+        "raise OSError('libgomp.so.1: cannot open “shared” object file')", encoding="utf-8"
+    )
+    process = check_in_a_process(PYTHONPATH=str(tmp_path), PYTHONIOENCODING="ascii")  # a console without such letters
+    assert process.returncode == 1 and process.stderr == ""
+    lines = process.stdout.splitlines()
+    broken = next(number for number, text in enumerate(lines) if "import torch" in text)
+    assert lines[broken].startswith("red") and r"libgomp.so.1: cannot open \u201cshared" in lines[broken]
+    assert "remedy: pip install -r environment.txt" in lines[broken + 1]
+    assert any(text.startswith("green  CarRacing, fast") for text in lines)
+
+
+def test_a_python_without_any_library_gets_a_report_not_a_traceback():
+    process = check_in_a_process("-S")
+    assert process.returncode == 1 and process.stderr == ""
+    assert "No module named 'numpy'" in process.stdout and "follow the remedies" in process.stdout
+
+
+def test_a_missing_package_and_a_wrong_version_are_red_with_what_is_wanted(monkeypatch):
+    installed = environment.version
+
+    def version(name):
+        if name == "cma":
+            raise PackageNotFoundError(name)
+        return {"gymnasium": "0.29.1", "box2d-py": "2.3.8"}.get(name) or installed(name)
+
+    monkeypatch.setattr(environment, "version", version)
+    report = check_environment()
+    assert not report.ok
+    assert line(report, "cma").found.startswith("missing for")
+    assert line(report, "gymnasium").found == "0.29.1, but stad_lab wants ==1.4.0"
+    assert "pip uninstall box2d-py box2d" in line(report, "box2d-py").remedy
+
+
+def test_a_black_picture_is_red(monkeypatch):
+    black = np.zeros((96, 96, 3), np.uint8)
+    monkeypatch.setattr("stad_lab.envs.car_racing.FastCarRacing._render", lambda self, mode: black)
+    report = environment.Report(tuple(environment.check_drive()))
+    assert line(report, "CarRacing, fast").state == "red" and "black" in line(report, "CarRacing, fast").found
+    assert line(report, "CarRacing, Gymnasium's").state == "green"
+
+
+def test_a_working_folder_that_is_missing_or_read_only_is_red(tmp_path, monkeypatch):
+    def refuse(dir):
+        raise PermissionError(f"[Errno 13] Permission denied: '{dir}'")
+
+    missing = line(check_environment(tmp_path / "missing"), "working folder")
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    closed = line(check_environment(tmp_path), "working folder")
+    assert missing.state == closed.state == "red" and missing.remedy and closed.remedy
+    assert "there is no such folder" in missing.found and "Permission denied" in closed.found
+
+
+def test_little_room_is_amber_and_none_is_red():
+    states = [environment.graded("free disk", found, amber=3, red=1, remedy="make room").state for found in (4, 2, 0.5)]
+    assert states == ["green", "amber", "red"]
+
+
+def test_in_a_container_files_that_were_read_do_not_count_as_used_memory(tmp_path, monkeypatch):
+    numbers = {"max": "3000000000\n", "current": "2900000000\n", "stat": "anon 5\ninactive_file 2800000000\n"}
+    for name, text in numbers.items():
+        (tmp_path / f"memory.{name}").write_text(text)
+    monkeypatch.setattr(environment, "LIMITS", tmp_path)
+    monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=8e9))
+    line = next(environment.check_memory())
+    assert line.state == "green" and line.found.startswith("2.9")
+
+
+def test_fewer_cores_by_a_container_s_limit_are_amber_unless_the_threads_are_set(tmp_path, monkeypatch):
+    (tmp_path / "cpu.max").write_text("200000 100000\n")
+    monkeypatch.setattr(environment, "LIMITS", tmp_path)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(64)), raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    (limited,) = environment.check_processors()
+    assert limited.state == "amber" and limited.found == "64, of which the container may use 2"
+    assert limited.remedy.startswith("set OMP_NUM_THREADS=2 ")
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    assert [line.state for line in environment.check_processors()] == ["green"]
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert [line.state for line in environment.check_processors()] == ["green"]
+
+
+def test_a_gpu_that_is_too_old_for_this_pytorch_is_amber_and_not_trained_on(monkeypatch, capsys):
+    def refuse(*given, device):
+        raise RuntimeError("CUDA error: no kernel image is available for execution on the device")
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Tesla V100")
+    monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["sm_90a", "sm_75", "sm_100", "compute_120"])
+    monkeypatch.setattr("torch.ones", refuse)
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (7, 0))
+    (gpu,) = environment.check_gpu()
+    assert gpu.state == "amber" and "Tesla V100 is too old for this PyTorch" in gpu.found
+    assert training_device().type == "cpu" and "no kernel image" in capsys.readouterr().err
+    monkeypatch.setattr("torch.ones", lambda *given, device: torch.zeros(1))
+    for capability in ((7, 5), (12, 0)):
+        monkeypatch.setattr("torch.cuda.get_device_capability", lambda found=capability: found)
+        (gpu,) = environment.check_gpu()
+        assert gpu.state == "green" and "Tesla V100" in gpu.found
+    monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["gfx906"])  # of another maker
+    assert [line.state for line in environment.check_gpu()] == ["green"]
+
+
+@pytest.mark.parametrize("refusing", ["torch.ones", "torch.cuda.get_device_name"])
+def test_a_gpu_that_another_process_has_taken_is_amber_because_none_is_needed(refusing, monkeypatch):
+    def refuse(*given, **named):
+        raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda: "A100")
+    monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (8, 0))
+    monkeypatch.setattr(refusing, refuse)
+    (gpu,) = environment.check_gpu()
+    assert gpu.state == "amber" and "busy" in gpu.found and "none is needed" in gpu.remedy
+
+
+def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):
+    assert next(environment.check_weights()).found.startswith(f"{len(list(PRETRAINED.rglob('*.safetensors')))} files")
+    cut = tmp_path / "pretrained" / "second_round" / "frame" / "mdn_rnn.safetensors"
+    cut.parent.mkdir(parents=True)
+    cut.write_bytes(b"version https://git-lfs.github.com/spec/v1")
+    monkeypatch.setattr(environment, "__file__", str(tmp_path / "environment.py"))
+    line = next(environment.check_weights())
+    assert line.state == "red" and "mdn_rnn" in line.found
+
+
+def test_an_unknown_preset_is_red_and_names_the_presets(monkeypatch):
+    monkeypatch.setenv("STAD_LAB_SETTINGS", "lapptop")
+    (wrong,) = environment.check_settings()
+    assert wrong.state == "red" and "lapptop" in wrong.found and "quick, laptop, paper" in wrong.remedy
+
+
+def test_in_a_notebook_the_remedies_stand_open_and_all_green_is_one_folded_line():
+    green, red = environment.Line("green", "a", "1"), environment.Line("red", "b", "<2>", "do this")
+    assert environment.Report((green,))._repr_html_().startswith("<details><summary>1 green: everything")
+    page = environment.Report((green, red))._repr_html_()
+    assert page.startswith("<details open>") and "do this" in page and "&lt;2&gt;" in page
