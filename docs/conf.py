@@ -18,12 +18,14 @@ from stad_lab import Settings
 HERE = Path(__file__).parent
 PACKAGE = HERE.parent / "stad_lab"
 sys.path.insert(0, str(HERE))
-from site_check import faults  # noqa: E402
+from site_check import faults
 
 
 def digest(folder: Path) -> str:
     """A short name for the present state of all files of a folder; the cache of outputs is valid for one state."""
-    files = sorted(file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts)
+    files = sorted(
+        file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts
+    )
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
 
@@ -40,13 +42,19 @@ root_doc = "docs/index"
 include_patterns = ["README.md", "docs/**", "notebooks/*.ipynb", "notebooks/exercises/*.*"]
 exclude_patterns = ["docs/_*", ".*", "runs", "**/.ipynb_checkpoints", "notebooks/exercises/*.py"]
 templates_path = [str(HERE / "_templates")]
-suppress_warnings = ["myst.header"]  # a notebook's markdown cell may begin a step at the second level
+suppress_warnings = [
+    "myst.header"
+]  # a notebook's markdown cell may begin a step at the second level
 
 # Notebooks
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # on busy cores, threads that wait for each other slow PyTorch manyfold
+os.environ.setdefault(
+    "OMP_NUM_THREADS", "1"
+)  # on busy cores, threads that wait for each other slow PyTorch manyfold
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(HERE / "_cache" / f"{Settings.preset().name}-{digest(PACKAGE)}")
-nb_execution_excludepatterns = ["notebooks/exercises/*"]  # their answers are missing, and they say so
+nb_execution_excludepatterns = [
+    "notebooks/exercises/*"
+]  # their answers are missing, and they say so
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_ipywidgets_js = {}  # widgets need a kernel, and their scripts a network: see explain_widgets
@@ -81,9 +89,14 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 def explain_widgets(app, doctree) -> None:
     """Where a widget stood in the notebook, say so: without a kernel there is nothing to move."""
     for bundle in list(doctree.findall(nodes.container)):
-        if any(isinstance(child, nodes.container) and child.get("mime_type") == WIDGET for child in bundle.children):
+        if any(
+            isinstance(child, nodes.container) and child.get("mime_type") == WIDGET
+            for child in bundle.children
+        ):
             text = "Here stands a widget that needs a running kernel: open the notebook in JupyterLab to move it."
-            bundle.replace_self(nodes.container("", nodes.paragraph("", text), classes=["without-kernel"]))
+            bundle.replace_self(
+                nodes.container("", nodes.paragraph("", text), classes=["without-kernel"])
+            )
 
 
 def check_site(app, error) -> None:

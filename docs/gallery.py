@@ -23,7 +23,9 @@ def figure_of(cell: str) -> bytes:
     last = [one["id"] for one in ran.cells].index(cell)
     ran.cells = ran.cells[: last + 1]
     NotebookClient(ran, timeout=600, resources={"metadata": {"path": str(NOTEBOOKS)}}).execute()
-    shown = "".join(output["data"].get("text/html", "") for output in ran.cells[-1].outputs if "data" in output)
+    shown = "".join(
+        output["data"].get("text/html", "") for output in ran.cells[-1].outputs if "data" in output
+    )
     return base64.b64decode(re.search(r"data:image/png;base64,([^\"]+)", shown).group(1))
 
 

@@ -4,7 +4,14 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-ADDRESSES = {"a": "href", "img": "src", "script": "src", "link": "href", "source": "src", "iframe": "src"}
+ADDRESSES = {
+    "a": "href",
+    "img": "src",
+    "script": "src",
+    "link": "href",
+    "source": "src",
+    "iframe": "src",
+}
 
 
 class Page(HTMLParser):
@@ -36,7 +43,9 @@ def faults(site: Path) -> list[str]:
     found = []
     for file, page in pages.items():
         name = file.relative_to(site).as_posix()
-        found += [f"{name}: a picture without alternative text: {picture}" for picture in page.speechless]
+        found += [
+            f"{name}: a picture without alternative text: {picture}" for picture in page.speechless
+        ]
         for tag, address in sorted(page.links):
             link = urlsplit(address)
             if link.scheme == "data" or (tag == "a" and link.scheme):

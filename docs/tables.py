@@ -43,30 +43,55 @@ def answer_table(rows: dict[str, list[Path]]) -> str:
         cells = []
         for column in columns:
             mean, (low, high), searches = found[column]
-            cells.append(f"{mean:.0f}" + f" ({low:.0f} to {high:.0f}; {len(searches)})" * bool(searches))
+            cells.append(
+                f"{mean:.0f}" + f" ({low:.0f} to {high:.0f}; {len(searches)})" * bool(searches)
+            )
         lines.append(line(f"`{variant}`", *cells))
     return "\n".join(lines)
 
 
 def spread_table(rows: dict[str, list[Path]]) -> str:
     """How the drives of every row spread."""
-    lines = [line("row", "standard deviation", "median", "below 800", "best 90"), "|---|---|---|---|---|"]
+    lines = [
+        line("row", "standard deviation", "median", "below 800", "best 90"),
+        "|---|---|---|---|---|",
+    ]
     for name, folders in rows.items():
         returns, found = official_returns(folders), summarise_row(folders)
         failed = f"{(returns < 800).sum()} of {returns.size}"
-        numbers = f"{found['standard_deviation']:.0f}", f"{np.median(returns):.1f}", failed, f"{found['top_90']:.1f}"
+        numbers = (
+            f"{found['standard_deviation']:.0f}",
+            f"{np.median(returns):.1f}",
+            failed,
+            f"{found['top_90']:.1f}",
+        )
         lines.append(line(f"`{name}`", *numbers))
     return "\n".join(lines)
 
 
 def searches_table(rows: dict[str, list[Path]]) -> str:
     """The searches of the paper's recipe one by one; a V is named by the first four digits of its identity."""
-    head = "search", "V", "mean of 100 tracks", "complete laps", "below 800", "last five looks", "less `frame`"
-    lines, frames = [line(*head), "|---" * len(head) + "|"], {one.name: one for one in rows["paper_frame"]}
+    head = (
+        "search",
+        "V",
+        "mean of 100 tracks",
+        "complete laps",
+        "below 800",
+        "last five looks",
+        "less `frame`",
+    )
+    lines, frames = (
+        [line(*head), "|---" * len(head) + "|"],
+        {one.name: one for one in rows["paper_frame"]},
+    )
     for variant in VARIANTS:
         for folder in rows.get(f"paper_{variant}", []):
             returns, frame = official_returns([folder]), frames.get(folder.name)
-            lead = f"{returns.mean() - official_returns([frame]).mean():+.1f}" if variant != "frame" and frame else ""
+            lead = (
+                f"{returns.mean() - official_returns([frame]).mean():+.1f}"
+                if variant != "frame" and frame
+                else ""
+            )
             counts = f"{(returns >= 900).sum()}", f"{(returns < 800).sum()}"
             last = f"{learning_curve(folder)[1][-5:].mean():.0f}"
             name = f"`paper_{variant}`, seed {folder.name.removeprefix('seed')}"
@@ -79,17 +104,31 @@ def variants_table(rows: dict[str, list[Path]]) -> str:
     """The four variants of our recipe, seed by seed, before and after the finish."""
     ahead, lines = "`frame` is ahead by", []
     head = "official tracks", "seeds, after two rounds", "below 800", "median", ahead
-    lines += [line(*head, "seeds, after the finish", "below 800", "gain of the finish", ahead), "|---" * 9 + "|"]
+    lines += [
+        line(*head, "seeds, after the finish", "below 800", "gain of the finish", ahead),
+        "|---" * 9 + "|",
+    ]
     frames = [official_returns(rows[f"{recipe}_frame"]) for recipe in ("two_rounds", "finished")]
     for variant in VARIANTS:
         cells = [f"`{variant}`, official"]
-        before, after = (official_returns(rows[f"{recipe}_{variant}"]) for recipe in ("two_rounds", "finished"))
+        before, after = (
+            official_returns(rows[f"{recipe}_{variant}"]) for recipe in ("two_rounds", "finished")
+        )
         finished = {folder.name for folder in rows[f"finished_{variant}"]}
-        gain = after - official_returns([one for one in rows[f"two_rounds_{variant}"] if one.name in finished])
-        told = f"{np.median(before):.1f}", "{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain))
+        gain = after - official_returns(
+            [one for one in rows[f"two_rounds_{variant}"] if one.name in finished]
+        )
+        told = (
+            f"{np.median(before):.1f}",
+            "{:.1f} ({:.1f} to {:.1f})".format(gain.mean(), *bootstrap(gain)),
+        )
         for frame, returns, extra in zip(frames, (before, after), told, strict=True):
             low, high = bootstrap_gain(frame, returns)
-            lead = f"{frame.mean() - returns.mean():.1f} ({-high:.1f} to {-low:.1f})" if variant != "frame" else ""
+            lead = (
+                f"{frame.mean() - returns.mean():.1f} ({-high:.1f} to {-low:.1f})"
+                if variant != "frame"
+                else ""
+            )
             seeds = ", ".join(f"{mean:.1f}" for mean in returns.mean(axis=1))
             cells += [seeds, f"{(returns < 800).sum()} of {returns.size}", extra, lead]
         lines.append(line(*cells))
@@ -100,7 +139,9 @@ def changes_table(rows: dict[str, list[Path]], base_name: str) -> str:
     """What every single change of a row of one round is worth: of "one_round", or of "another_V"."""
     base = official_returns(rows[base_name])
     laps = (base >= 900).mean(axis=1)
-    there = f"{laps.mean():.0%} there" + f", {laps.min():.0%} to {laps.max():.0%} by search" * (len(laps) > 1)
+    there = f"{laps.mean():.0%} there" + f", {laps.min():.0%} to {laps.max():.0%} by search" * (
+        len(laps) > 1
+    )
     head = f"difference to `{base_name}`", "what differs", "of the mean"
     interval = "95% interval (of a single search: without its luck)"
     lines = [line(*head, interval, "of the median", f"complete laps ({there})"), "|---" * 6 + "|"]

@@ -15,7 +15,9 @@ from pathlib import Path
 
 from stad_lab.doctor import escape_foreign_letters, tell_environment
 
-if __name__ == "__main__" and sys.argv[1:] == ["check"]:  # before the imports that a broken installation would fail
+if __name__ == "__main__" and sys.argv[1:] == [
+    "check"
+]:  # before the imports that a broken installation would fail
     escape_foreign_letters()
     sys.exit(tell_environment())
 
@@ -41,7 +43,8 @@ from stad_lab.training.pipeline import STAGES, ship, train
 def build_parser() -> argparse.ArgumentParser:
     """The whole command line with its help."""
     parser = argparse.ArgumentParser(
-        prog="python -m stad_lab", description="Teach a car to drive with a model of its world (STAD)."
+        prog="python -m stad_lab",
+        description="Teach a car to drive with a model of its world (STAD).",
     )
     parser.set_defaults(resumes=False)
     commands = parser.add_subparsers(dest="command", required=True)
@@ -75,7 +78,9 @@ def main(arguments: list[str] | None = None) -> int:
     except (MemoryError, OverflowError, RuntimeError) as error:
         if not is_too_large(error):
             raise
-        print(f"error: too large for this machine: {error or type(error).__name__}", file=sys.stderr)
+        print(
+            f"error: too large for this machine: {error or type(error).__name__}", file=sys.stderr
+        )
         return 2
     except KeyboardInterrupt:
         again = "; the same command goes on from the last checkpoint" if options.resumes else ""
@@ -104,7 +109,9 @@ def add_variant(command: argparse.ArgumentParser) -> None:
 
 def add_path(command: argparse.ArgumentParser) -> None:
     """The option --path, of a run or of the agent that comes with stad_lab."""
-    command.add_argument("--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab")
+    command.add_argument(
+        "--path", type=Path, help="folder of a run; default: the agent that comes with stad_lab"
+    )
 
 
 def add_scheduler(command: argparse.ArgumentParser) -> None:
@@ -129,7 +136,10 @@ def add_changes(command: argparse.ArgumentParser, what: str) -> None:
 def add_parts(command: argparse.ArgumentParser, parts: Iterable[str]) -> None:
     """The option --part."""
     command.add_argument(
-        "--part", action="append", choices=list(parts), help="only this part; may be repeated; default all"
+        "--part",
+        action="append",
+        choices=list(parts),
+        help="only this part; may be repeated; default all",
     )
 
 
@@ -146,7 +156,9 @@ def read_changes(changes: list[str]) -> dict:
             values[name] = readers.get(kinds.get(name, str), json.loads)(text)
         except ValueError:
             hint = " (true or false)" if kinds.get(name) is bool else ""
-            raise ValueError(f"--set {change!r}: expected {name} as {kinds[name].__name__}{hint}") from None
+            raise ValueError(
+                f"--set {change!r}: expected {name} as {kinds[name].__name__}{hint}"
+            ) from None
     return values
 
 
@@ -156,7 +168,9 @@ def drivers(scheduler: str | None) -> Iterator[Executor | None]:
     if scheduler is None:
         yield None
     else:
-        from stad_lab.io.dask_cluster import cluster  # Dask takes a second to import, and few need it
+        from stad_lab.io.dask_cluster import (
+            cluster,
+        )  # Dask takes a second to import, and few need it
 
         with cluster(scheduler) as executor:
             yield executor
@@ -167,7 +181,9 @@ def drivers(scheduler: str | None) -> Iterator[Executor | None]:
 
 def add_check(commands: argparse._SubParsersAction) -> None:
     """The command check."""
-    command = commands.add_parser("check", help="is everything installed, and what to do about what is not")
+    command = commands.add_parser(
+        "check", help="is everything installed, and what to do about what is not"
+    )
     command.set_defaults(do=lambda _: tell_environment())
 
 
@@ -181,17 +197,24 @@ def add_train(commands: argparse._SubParsersAction) -> None:
     add_variant(command)
     add_scheduler(command)
     command.add_argument(
-        "--settings", help=f"preset: {', '.join(PRESETS)}; default: $STAD_LAB_SETTINGS, or else laptop"
+        "--settings",
+        help=f"preset: {', '.join(PRESETS)}; default: $STAD_LAB_SETTINGS, or else laptop",
     )
-    command.add_argument("--out", required=True, type=Path, help="folder of the run, for example runs/input")
-    command.add_argument("--rollouts", type=Path, help="folder of the rollouts, to share them; default OUT/rollouts")
+    command.add_argument(
+        "--out", required=True, type=Path, help="folder of the run, for example runs/input"
+    )
+    command.add_argument(
+        "--rollouts", type=Path, help="folder of the rollouts, to share them; default OUT/rollouts"
+    )
     command.add_argument(
         "--earlier",
         type=Path,
         metavar="RUN",
         help="a second round: this run's agent drives agent_episodes for the rollouts, and C goes on from its C",
     )
-    command.add_argument("--until", default=STAGES[-1], help=f"last stage to run: {', '.join(STAGES)}; default all")
+    command.add_argument(
+        "--until", default=STAGES[-1], help=f"last stage to run: {', '.join(STAGES)}; default all"
+    )
     add_changes(
         command,
         "change one setting of the preset, for example --set stride=2; may be repeated."
@@ -221,7 +244,9 @@ def add_finish(commands: argparse._SubParsersAction) -> None:
     add_variant(command)
     add_scheduler(command)
     add_path(command)
-    command.add_argument("--out", required=True, type=Path, help="folder of the finish, for example runs/finished")
+    command.add_argument(
+        "--out", required=True, type=Path, help="folder of the finish, for example runs/finished"
+    )
     add_changes(
         command,
         "change one setting of the finish; may be repeated. It is the run's, but for"
@@ -252,8 +277,12 @@ def add_evaluate(commands: argparse._SubParsersAction) -> None:
     add_scheduler(command)
     add_path(command)
     command.add_argument("--episodes", type=int, default=100, help="number of tracks, default 100")
-    command.add_argument("--first-track", type=int, default=0, help="seed of the first track, default 0")
-    command.add_argument("--fast", action="store_true", help="draw with the fast renderer (not for reports)")
+    command.add_argument(
+        "--first-track", type=int, default=0, help="seed of the first track, default 0"
+    )
+    command.add_argument(
+        "--fast", action="store_true", help="draw with the fast renderer (not for reports)"
+    )
     add_processes(command)
     command.add_argument(
         "--json",
@@ -313,10 +342,16 @@ def add_replicate(commands: argparse._SubParsersAction) -> None:
     )
     add_scheduler(command)
     command.add_argument("--row", required=True, help=f"one of {', '.join([*ROWS, *FLOORS])}")
-    command.add_argument("--out", required=True, type=Path, help="folder of all rows, for example runs/table")
-    command.add_argument("--seeds", type=int, nargs="+", help="of the searches for C; all of the row's without it")
     command.add_argument(
-        "--keep", action="store_true", help="only copy the records of the finished seeds to stad_lab/records/table"
+        "--out", required=True, type=Path, help="folder of all rows, for example runs/table"
+    )
+    command.add_argument(
+        "--seeds", type=int, nargs="+", help="of the searches for C; all of the row's without it"
+    )
+    command.add_argument(
+        "--keep",
+        action="store_true",
+        help="only copy the records of the finished seeds to stad_lab/records/table",
     )
     command.set_defaults(do=do_replicate, resumes=True)
 
@@ -329,7 +364,9 @@ def do_replicate(options: argparse.Namespace) -> None:
         return
     with drivers(options.scheduler) as executor:
         print(describe_time(options.row, time_needed(options.row, options.seeds)), flush=True)
-        print(describe_row(options.row, replicate(options.row, options.out, executor, options.seeds)))
+        print(
+            describe_row(options.row, replicate(options.row, options.out, executor, options.seeds))
+        )
 
 
 def add_table(commands: argparse._SubParsersAction) -> None:
@@ -341,7 +378,10 @@ def add_table(commands: argparse._SubParsersAction) -> None:
         " the paper reports of the four variants beside what came out here.",
     )
     command.add_argument(
-        "--records", type=Path, default=RECORDS, help="folder of rows, for example runs/table; default: ours"
+        "--records",
+        type=Path,
+        default=RECORDS,
+        help="folder of rows, for example runs/table; default: ours",
     )
     command.add_argument("--picture", type=Path, help="the PNG to write, for example claims.png")
     command.set_defaults(do=do_table)
@@ -360,7 +400,10 @@ def do_table(options: argparse.Namespace) -> None:
         check_writable(options.picture)
     print(describe_table(rows))
     if options.picture:
-        from stad_lab.viz.plots import plot_claims, to_png  # matplotlib takes a second, and workers import this file
+        from stad_lab.viz.plots import (
+            plot_claims,
+            to_png,
+        )  # matplotlib takes a second, and workers import this file
 
         figure = plot_claims(claims_and_outcomes(rows))
         write_bytes(options.picture, to_png(figure))
@@ -378,10 +421,14 @@ def add_probe(commands: argparse._SubParsersAction) -> None:
     )
     add_variant(command)
     add_path(command)
-    command.add_argument("--drives", type=int, default=PROBE_DRIVES, help=f"random drives, default {PROBE_DRIVES}")
+    command.add_argument(
+        "--drives", type=int, default=PROBE_DRIVES, help=f"random drives, default {PROBE_DRIVES}"
+    )
     add_processes(command)
     command.add_argument(
-        "--json", type=Path, help="where to write the result; default probe-VARIANT.json in the run, or here"
+        "--json",
+        type=Path,
+        help="where to write the result; default probe-VARIANT.json in the run, or here",
     )
     command.set_defaults(do=do_probe)
 
@@ -408,15 +455,22 @@ def add_study(commands: argparse._SubParsersAction) -> None:
         " which takes an hour or two; stop it when you like, the same command goes on.",
     )
     command.add_argument("--settings", help="preset of what is trained; default: as for train")
-    command.add_argument("--out", required=True, type=Path, help="folder for what is trained, and for study.json")
-    command.add_argument("--rollouts", type=Path, help="folder of the rollouts; default OUT/rollouts")
+    command.add_argument(
+        "--out", required=True, type=Path, help="folder for what is trained, and for study.json"
+    )
+    command.add_argument(
+        "--rollouts", type=Path, help="folder of the rollouts; default OUT/rollouts"
+    )
     add_parts(command, STUDY_PARTS)
     command.set_defaults(do=do_study, resumes=True)
 
 
 def do_study(options: argparse.Namespace) -> None:
     """Measure the parts."""
-    settings, rollouts = Settings.preset(options.settings), options.rollouts or options.out / "rollouts"
+    settings, rollouts = (
+        Settings.preset(options.settings),
+        options.rollouts or options.out / "rollouts",
+    )
     file = options.out / "study.json"
     check_writable(file)
     study(settings, rollouts, options.out, options.part or list(STUDY_PARTS))
@@ -433,8 +487,12 @@ def add_benchmark(commands: argparse._SubParsersAction) -> None:
         " takes part if it is installed.",
     )
     add_parts(command, PARTS)
-    command.add_argument("--rounds", type=int, default=5, help="how often the contenders take turns, default 5")
-    command.add_argument("--json", type=Path, default=Path("benchmark.json"), help="where to write every measurement")
+    command.add_argument(
+        "--rounds", type=int, default=5, help="how often the contenders take turns, default 5"
+    )
+    command.add_argument(
+        "--json", type=Path, default=Path("benchmark.json"), help="where to write every measurement"
+    )
     command.set_defaults(do=do_benchmark)
 
 
@@ -447,7 +505,9 @@ def do_benchmark(options: argparse.Namespace) -> None:
 
 def add_ship(commands: argparse._SubParsersAction) -> None:
     """The command ship."""
-    command = commands.add_parser("ship", help="copy a run's weights and records to stad_lab/pretrained")
+    command = commands.add_parser(
+        "ship", help="copy a run's weights and records to stad_lab/pretrained"
+    )
     add_variant(command)
     command.add_argument("--path", type=Path, required=True, help="folder of the run")
     command.set_defaults(do=do_ship)
@@ -467,27 +527,45 @@ def add_film(commands: argparse._SubParsersAction) -> None:
     )
     add_variant(command)
     add_path(command)
-    command.add_argument("--out", type=Path, required=True, help="the GIF to write; with --viewer it may be a .webp")
     command.add_argument(
-        "--viewer", action="store_true", help="film everything: latents, forecast, action and return too"
+        "--out", type=Path, required=True, help="the GIF to write; with --viewer it may be a .webp"
+    )
+    command.add_argument(
+        "--viewer",
+        action="store_true",
+        help="film everything: latents, forecast, action and return too",
     )
     command.add_argument("--track", type=int, default=5, help="seed of the track, default 5")
-    command.add_argument("--first", type=int, default=60, help="first frame shown, default 60: after the opening zoom")
-    command.add_argument("--frames", type=int, default=240, help="frames covered, default 240; every third is shown")
+    command.add_argument(
+        "--first",
+        type=int,
+        default=60,
+        help="first frame shown, default 60: after the opening zoom",
+    )
+    command.add_argument(
+        "--frames", type=int, default=240, help="frames covered, default 240; every third is shown"
+    )
     command.set_defaults(do=do_film)
 
 
 def do_film(options: argparse.Namespace) -> None:
     """Drive, and write the picture."""
-    from stad_lab.viz.video import film_agent, film_viewer  # matplotlib takes a second, and workers import this file
+    from stad_lab.viz.video import (
+        film_agent,
+        film_viewer,
+    )  # matplotlib takes a second, and workers import this file
 
     agent = load_agent(options.variant, options.path)
     shown = (agent, options.track, options.first, options.frames)
     kind = options.out.suffix.lstrip(".").lower()
     if not options.viewer and kind != "gif":
-        raise ValueError(f"--out {options.out}: expected a file that ends in .gif (or, with --viewer, .webp)")
+        raise ValueError(
+            f"--out {options.out}: expected a file that ends in .gif (or, with --viewer, .webp)"
+        )
     check_writable(options.out)
-    write_bytes(options.out, film_viewer(*shown, kind=kind) if options.viewer else film_agent(*shown))
+    write_bytes(
+        options.out, film_viewer(*shown, kind=kind) if options.viewer else film_agent(*shown)
+    )
     print(f"filmed to {options.out}")
 
 

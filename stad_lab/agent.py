@@ -17,7 +17,14 @@ from stad_lab.envs.frames import FrameMemory, to_frame
 from stad_lab.io.files import load_tensors, save_tensors
 from stad_lab.models.controller import check_parameters, control, parameter_count
 from stad_lab.models.mdn_rnn import MDNRNN, State, check_partner, load_mdn_rnn
-from stad_lab.models.vae import REMEDY, AutoEncoder, check_part, check_variant, load_autoencoder, to_pictures
+from stad_lab.models.vae import (
+    REMEDY,
+    AutoEncoder,
+    check_part,
+    check_variant,
+    load_autoencoder,
+    to_pictures,
+)
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 CONTROLLER = "controller.safetensors"  # the file of C
@@ -40,7 +47,14 @@ class Agent:
         ValueError: parameters of another number than V's latents and M's memory ask for.
     """
 
-    def __init__(self, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, parameters: np.ndarray, stride: int, crop_bar: bool):
+    def __init__(
+        self,
+        autoencoder: AutoEncoder,
+        mdn_rnn: MDNRNN,
+        parameters: np.ndarray,
+        stride: int,
+        crop_bar: bool,
+    ):
         check_parameters(parameters, parameter_count(autoencoder.latent_size, mdn_rnn.hidden_size))
         self.autoencoder, self.mdn_rnn, self.parameters = autoencoder, mdn_rnn, parameters
         self.stride, self.crop_bar = stride, crop_bar
@@ -49,7 +63,9 @@ class Agent:
     def reset(self) -> None:
         """Forget the past: every episode begins with this."""
         self.memory = FrameMemory(self.stride)
-        self.cars: np.ndarray | None = None  # which of the cars of the first step still drive, int (cars,)
+        self.cars: np.ndarray | None = (
+            None  # which of the cars of the first step still drive, int (cars,)
+        )
         self.state: State | None = None
         self.latents: np.ndarray | None = None
         self.hidden: np.ndarray | None = None
@@ -76,9 +92,13 @@ class Agent:
         frame, difference = to_pictures(frames, self.memory.push(frames))
         latents, _ = self.autoencoder.encode(frame, difference)
         if self.state is None:
-            self.state = tuple(torch.zeros(1, len(frames), self.mdn_rnn.hidden_size) for _ in range(2))
+            self.state = tuple(
+                torch.zeros(1, len(frames), self.mdn_rnn.hidden_size) for _ in range(2)
+            )
         self.latents, self.hidden = latents.numpy(), self.state[0][0].numpy()
-        actions = control(self.present_parameters(), np.concatenate([self.latents, self.hidden], axis=1))
+        actions = control(
+            self.present_parameters(), np.concatenate([self.latents, self.hidden], axis=1)
+        )
         self.take_in(actions, self.state)
         return actions
 
@@ -111,7 +131,11 @@ class Agent:
         self._check_acted()
         self.memory.keep(cars)
         self.state = tuple(part[:, cars] for part in self.state)
-        self.latents, self.hidden, self.cars = self.latents[cars], self.hidden[cars], self.cars[cars]
+        self.latents, self.hidden, self.cars = (
+            self.latents[cars],
+            self.hidden[cars],
+            self.cars[cars],
+        )
 
     def _check_acted(self) -> None:
         if self.latents is None:
@@ -158,7 +182,9 @@ def drive(
     """
     if max_frames < 1:
         raise ValueError(f"max_frames={max_frames}: expected at least 1")
-    tracks = [int(track) for track in tracks]  # those of an array are NumPy's, which Gymnasium refuses
+    tracks = [
+        int(track) for track in tracks
+    ]  # those of an array are NumPy's, which Gymnasium refuses
     if min(tracks, default=0) < 0:
         raise ValueError(f"track {min(tracks)}: expected at least 0, the seeds of tracks")
     unseen = {"bar": False} if fast and agent.crop_bar else {}  # what V crops need not be drawn
@@ -170,8 +196,13 @@ def drive(
     agent.reset()
     while driving:
         going_on = []
-        for place, (car, action) in enumerate(zip(driving, agent.act_batch(observations), strict=True)):
-            if top_speed < math.inf and envs[car].unwrapped.car.hull.linearVelocity.length > top_speed:
+        for place, (car, action) in enumerate(
+            zip(driving, agent.act_batch(observations), strict=True)
+        ):
+            if (
+                top_speed < math.inf
+                and envs[car].unwrapped.car.hull.linearVelocity.length > top_speed
+            ):
                 action[1] = 0.0
             observations[place], reward, terminated, truncated, _ = envs[car].step(action)
             returns[car] += reward
@@ -184,7 +215,10 @@ def drive(
             else:
                 envs[car].close()  # lets go of its painted track
         if len(going_on) < len(driving):
-            driving, observations = [driving[p] for p in going_on], [observations[p] for p in going_on]
+            driving, observations = (
+                [driving[p] for p in going_on],
+                [observations[p] for p in going_on],
+            )
             agent.keep(np.array(going_on, int))
     return returns, lengths
 
@@ -213,7 +247,9 @@ def read_world_model(folder: Path, variant: str) -> WorldModel:
 def load_world_model(folder: Path, variant: str) -> WorldModel:
     """As `read_world_model`, but kept for as long as the files are the same, so that workers read them once."""
     files = [folder / name for name in ("autoencoder.safetensors", "mdn_rnn.safetensors")]
-    return read_once(folder, variant, tuple(file.stat().st_mtime_ns if file.exists() else 0 for file in files))
+    return read_once(
+        folder, variant, tuple(file.stat().st_mtime_ns if file.exists() else 0 for file in files)
+    )
 
 
 @functools.lru_cache(maxsize=2)
@@ -258,7 +294,13 @@ def load_agent(variant: str, path: str | Path | None = None) -> Agent:
         )
     world_model, path = read_world_model(folder, variant), folder / CONTROLLER
     parameters, facts = load_controller(path, variant)
-    agent = Agent(world_model.autoencoder, world_model.mdn_rnn, parameters, world_model.stride, world_model.crop_bar)
+    agent = Agent(
+        world_model.autoencoder,
+        world_model.mdn_rnn,
+        parameters,
+        world_model.stride,
+        world_model.crop_bar,
+    )
     check_partner(path, facts, **world_model.identities)
     return agent
 

@@ -40,13 +40,23 @@ from stad_lab.io.files import save_json
 from stad_lab.io.workers import keep_freed_memory, run_in_order, worker_processes
 from stad_lab.models.controller import control, initial_parameters
 from stad_lab.models.mdn_rnn import MDNRNN, mdn_loss, save_mdn_rnn
-from stad_lab.models.vae import AutoEncoder, autoencoder_losses, load_autoencoder, save_autoencoder, to_pictures
+from stad_lab.models.vae import (
+    AutoEncoder,
+    autoencoder_losses,
+    load_autoencoder,
+    save_autoencoder,
+    to_pictures,
+)
 from stad_lab.training.dataset import RandomDriver, Rollouts, collect_rollouts, track_seeds
 from stad_lab.training.evolution import drive_group, drive_parallel, hand_out, make_strategy
 from stad_lab.training.pipeline import provenance
 from stad_lab.training.trainer import read_ahead
 
-V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, and how many of them are not timed
+V_STEPS, M_STEPS, WARM_UP = (
+    60,
+    12,
+    5,
+)  # training steps of a round, and how many of them are not timed
 VARIANT = "input"  # of the shipped agent that drives
 GYMNASIUM, FAST, PHYSICS = "Gymnasium", "stad_lab", "physics alone, no picture"
 CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))
@@ -71,7 +81,13 @@ def benchmark(parts: list[str], rounds: int = 5, file: Path | None = None) -> di
         raise ValueError(
             f"parts={unknown or list(parts)}, rounds={rounds}: choose from {', '.join(PARTS)}, with 1 round or more"
         )
-    command = " ".join(["python -m stad_lab benchmark", *(f"--part {part}" for part in parts), f"--rounds {rounds}"])
+    command = " ".join(
+        [
+            "python -m stad_lab benchmark",
+            *(f"--part {part}" for part in parts),
+            f"--rounds {rounds}",
+        ]
+    )
     result = {"made_with": provenance(command) | {"trained_on": "cpu"}, "rounds": rounds}
     for part in parts:
         result[part] = PARTS[part](rounds)
@@ -101,7 +117,8 @@ def take_turns(contenders: dict[str, Callable[[int], float]], rounds: int, label
     medians = {name: float(np.median(values)) for name, values in speeds.items()}
     first = next(iter(medians.values()))
     return {
-        name: {"median": median, "ratio": median / first, "rounds": speeds[name]} for name, median in medians.items()
+        name: {"median": median, "ratio": median / first, "rounds": speeds[name]}
+        for name, median in medians.items()
     }
 
 
@@ -112,7 +129,11 @@ def describe(name: str, table: dict) -> str:
         if isinstance(value, dict):
             lines.append(f"    {row:<44}{value['median']:>10,.0f}{value['ratio']:>8.2f}x")
         else:
-            lines.append(f"    {row:<44}{value:>10,.3f}" if isinstance(value, float) else f"    {row:<44}{value!s:>10}")
+            lines.append(
+                f"    {row:<44}{value:>10,.3f}"
+                if isinstance(value, float)
+                else f"    {row:<44}{value!s:>10}"
+            )
     return "\n".join(lines)
 
 
@@ -122,12 +143,22 @@ def describe(name: str, table: dict) -> str:
 def measure_parity(rounds: int) -> dict:
     """Drive 20 whole episodes in both environments, on and off the road."""
     with worker_processes(2) as executor:
-        episodes = run_in_order(executor, compare_pictures, [(number,) for number in range(20)], "parity")
+        episodes = run_in_order(
+            executor, compare_pictures, [(number,) for number in range(20)], "parity"
+        )
     names = ("whole picture", "window of 24 x 24 around the car", "indicator bar")
     errors = np.concatenate([errors for errors, _ in episodes])
-    table = {f"{name}, mean": float(mean) for name, mean in zip(names, errors.mean(axis=0), strict=True)}
-    table |= {f"{name}, worst frame": float(worst) for name, worst in zip(names, errors.max(axis=0), strict=True)}
-    table |= {"frames compared": len(errors), "rewards and endings equal": all(equal for _, equal in episodes)}
+    table = {
+        f"{name}, mean": float(mean) for name, mean in zip(names, errors.mean(axis=0), strict=True)
+    }
+    table |= {
+        f"{name}, worst frame": float(worst)
+        for name, worst in zip(names, errors.max(axis=0), strict=True)
+    }
+    table |= {
+        "frames compared": len(errors),
+        "rewards and endings equal": all(equal for _, equal in episodes),
+    }
     return {"mean absolute difference between the pictures, of 255": table}
 
 
@@ -142,7 +173,11 @@ def compare_pictures(number: int, frames: int = MAX_FRAMES) -> tuple[np.ndarray,
     driver, envs = RandomDriver(rng), [make_env(fast) for fast in (True, False)]
     pictures = [[env.reset(seed=track_seeds("test", 20, 5)[number])[0]] for env in envs]
     if number % 2:
-        start = {"tile": int(rng.integers(10_000)), "speed": rng.uniform(0, 90), "turn": 0.15 * rng.standard_normal()}
+        start = {
+            "tile": int(rng.integers(10_000)),
+            "speed": rng.uniform(0, 90),
+            "turn": 0.15 * rng.standard_normal(),
+        }
         pictures = [[place_car(env, **start)] for env in envs]
     equal = True
     for _ in range(frames):
@@ -168,13 +203,17 @@ def measure_renderer(rounds: int) -> dict:
     """
     cv2.setNumThreads(1)
     envs = {GYMNASIUM: make_env(fast=False), FAST: make_env(), PHYSICS: make_blind_env()}
-    contenders = {name: lambda number, env=env: random_episodes(env, number) for name, env in envs.items()}
+    contenders = {
+        name: lambda number, env=env: random_episodes(env, number) for name, env in envs.items()
+    }
     if importlib.util.find_spec("envpool"):
         import envpool  # optional: pip install envpool
 
         pool = envpool.make_gymnasium("CarRacing-v3", num_envs=1, num_threads=1, seed=0)
         pool.reset()
-        contenders[f"EnvPool {importlib.metadata.version('envpool')}"] = lambda number: pool_episode(pool, number)
+        contenders[f"EnvPool {importlib.metadata.version('envpool')}"] = lambda number: (
+            pool_episode(pool, number)
+        )
     else:
         print("EnvPool is not installed and takes no part; to have it in: pip install envpool")
     for contender in contenders.values():  # a warm-up: caches fill, memory is taken
@@ -229,22 +268,32 @@ def measure_loop(rounds: int) -> dict:
     settings = Settings.preset("paper")
     folder, agent = PRETRAINED / VARIANT, load_agent(VARIANT)
     rng = np.random.default_rng(0)
-    population = agent.parameters + 0.01 * rng.standard_normal((settings.population, agent.parameters.size))
-    with tempfile.TemporaryDirectory() as large, worker_processes(1) as one, worker_processes(2) as two:
+    population = agent.parameters + 0.01 * rng.standard_normal(
+        (settings.population, agent.parameters.size)
+    )
+    with (
+        tempfile.TemporaryDirectory() as large,
+        worker_processes(1) as one,
+        worker_processes(2) as two,
+    ):
         make_world_models_sizes(Path(large))
         speed = functools.partial(generation_speed, population, settings)
         contenders = {
             "Gymnasium alone, no agent, 2 processes": lambda number: gymnasium_speed(two, number),
             "8 agents, shipped V + M + C, 2 processes": functools.partial(speed, two, folder),
             "8 agents, shipped V + M + C, 1 process": functools.partial(speed, one, folder),
-            "8 agents, World Models' sizes, 2 processes": functools.partial(speed, two, Path(large)),
+            "8 agents, World Models' sizes, 2 processes": functools.partial(
+                speed, two, Path(large)
+            ),
         }
         for contender in contenders.values():
             contender(rounds)
         tables = {"frames a second, a generation": take_turns(contenders, rounds, "loop")}
         short = dataclasses.replace(settings, max_frames=250)
         crowds = {
-            f"{cars} in step": lambda number, cars=cars: crowd_speed(one, agent.parameters, cars, short)
+            f"{cars} in step": lambda number, cars=cars: crowd_speed(
+                one, agent.parameters, cars, short
+            )
             for cars in (1, 2, 4, 8, 16, 32)
         }
         tables["frames a second, cars in one process"] = take_turns(crowds, rounds, "cars")
@@ -261,29 +310,43 @@ def make_world_models_sizes(folder: Path) -> None:
     torch.manual_seed(0)
     settings = Settings.preset("paper")
     autoencoder = AutoEncoder(VARIANT, settings.latent_size, settings.width)
-    save_pair(folder, autoencoder, read_world_model(PRETRAINED / VARIANT, VARIANT).mdn_rnn, settings)
+    save_pair(
+        folder, autoencoder, read_world_model(PRETRAINED / VARIANT, VARIANT).mdn_rnn, settings
+    )
 
 
 def save_pair(folder: Path, autoencoder: AutoEncoder, mdn_rnn: MDNRNN, settings: Settings) -> None:
     """Write a V and an M that were not trained together as if they were, so that agents can drive with both."""
     save_autoencoder(folder / "autoencoder.safetensors", autoencoder, settings, [])
     identity = load_autoencoder(folder / "autoencoder.safetensors")[1]["identity"]
-    save_mdn_rnn(folder / "mdn_rnn.safetensors", mdn_rnn, autoencoder.variant, settings, [], identity)
+    save_mdn_rnn(
+        folder / "mdn_rnn.safetensors", mdn_rnn, autoencoder.variant, settings, [], identity
+    )
 
 
-def generation_speed(population: np.ndarray, settings: Settings, executor: Executor, source: Any, number: int) -> float:
+def generation_speed(
+    population: np.ndarray, settings: Settings, executor: Executor, source: Any, number: int
+) -> float:
     """Frames a second of all agents together, each on the tracks of the generation of this number."""
     tracks = track_seeds("evolve", settings.tracks, 9, number)
     agents = np.repeat(population, len(tracks), axis=0)
     begin = time.perf_counter()
-    _, lengths = drive_parallel(executor, source, VARIANT, agents, tracks * len(population), settings)
+    _, lengths = drive_parallel(
+        executor, source, VARIANT, agents, tracks * len(population), settings
+    )
     return lengths.sum() / (time.perf_counter() - begin)
 
 
 def crowd_speed(executor: Executor, parameters: np.ndarray, cars: int, settings: Settings) -> float:
     """Frames a second of one process in which so many cars drive in step."""
-    agents, tracks, begin = np.repeat(parameters[None], cars, axis=0), list(range(cars)), time.perf_counter()
-    _, lengths = executor.submit(drive_group, PRETRAINED / VARIANT, VARIANT, agents, tracks, True, settings).result()
+    agents, tracks, begin = (
+        np.repeat(parameters[None], cars, axis=0),
+        list(range(cars)),
+        time.perf_counter(),
+    )
+    _, lengths = executor.submit(
+        drive_group, PRETRAINED / VARIANT, VARIANT, agents, tracks, True, settings
+    ).result()
     return lengths.sum() / (time.perf_counter() - begin)
 
 
@@ -323,7 +386,9 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
         environment.reset(seed=0)
     with_picture, without = (iter(actions) for _ in range(2))
     seconds["physics"] = seconds_of(lambda: blind.step(next(without)), frames)
-    seconds["picture"] = seconds_of(lambda: env.step(next(with_picture)), frames) - seconds["physics"]
+    seconds["picture"] = (
+        seconds_of(lambda: env.step(next(with_picture)), frames) - seconds["physics"]
+    )
     memory, observations = FrameMemory(agent.stride), [observation] * cars
 
     def prepare():
@@ -336,7 +401,9 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
         seconds["V"] = seconds_of(lambda: autoencoder.encode(*pictures), frames // 4) / cars
         latents, chosen = torch.zeros(cars, 1, mdn_rnn.latent_size), torch.zeros(cars, 1, 3)
         state = tuple(torch.zeros(1, cars, mdn_rnn.hidden_size) for _ in range(2))
-        seconds["M"] = seconds_of(lambda: mdn_rnn.remember(latents, chosen, state), frames // 4) / cars
+        seconds["M"] = (
+            seconds_of(lambda: mdn_rnn.remember(latents, chosen, state), frames // 4) / cars
+        )
     features = np.zeros((cars, mdn_rnn.latent_size + mdn_rnn.hidden_size), np.float32)
     seconds["C"] = seconds_of(lambda: control(parameters, features), frames // 4) / cars
     seconds["all else"] = whole - sum(seconds.values())
@@ -363,16 +430,23 @@ def measure_training(rounds: int) -> dict:
             losses = {"plain": [], FAST: []}
 
             def train(name: str, number: int, width: int = width, losses: dict = losses) -> float:
-                speed, loss = in_fresh_process(train_v, name == "plain", width, Path(folder), number)
+                speed, loss = in_fresh_process(
+                    train_v, name == "plain", width, Path(folder), number
+                )
                 losses[name].append(loss)
                 return speed
 
             contenders = {name: functools.partial(train, name) for name in losses}
-            tables[f"images a second, V of width {width}"] = take_turns(contenders, rounds, f"V of width {width}")
+            tables[f"images a second, V of width {width}"] = take_turns(
+                contenders, rounds, f"V of width {width}"
+            )
             tables[f"held-out loss after {V_STEPS} steps, V of width {width}"] = {
                 name: float(np.mean(values)) for name, values in losses.items()
             }
-    contenders = {name: functools.partial(in_fresh_process, train_m, name == "plain") for name in ("plain", FAST)}
+    contenders = {
+        name: functools.partial(in_fresh_process, train_m, name == "plain")
+        for name in ("plain", FAST)
+    }
     return tables | {"frames a second, M at paper settings": take_turns(contenders, rounds, "M")}
 
 
@@ -396,7 +470,9 @@ class Pictures(Dataset):
         return frame[0].contiguous(), difference[0].contiguous()
 
 
-def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STEPS) -> tuple[float, float]:
+def train_v(
+    plain: bool, width: int, folder: Path, seed: int, steps: int = V_STEPS
+) -> tuple[float, float]:
     """Train V for a few steps: (images a second, held-out loss after them).
 
     Plain is what a tutorial would write: a Dataset of single pictures, a DataLoader, PyTorch's layers, memory order and
@@ -410,20 +486,28 @@ def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STE
     autoencoder = AutoEncoder(VARIANT, settings.latent_size, width)
     rng = np.random.default_rng(seed)
     batches = [np.sort(rng.choice(training, settings.v_batch)) for _ in range(steps)]
-    noise = torch.from_numpy(rng.standard_normal((steps, settings.v_batch, settings.latent_size), np.float32))
+    noise = torch.from_numpy(
+        rng.standard_normal((steps, settings.v_batch, settings.latent_size), np.float32)
+    )
     if plain:
         for place, stride in ((2, 1), (-1, 2)):
             ours = autoencoder.decoder[place]
-            layer = nn.ConvTranspose2d(ours.in_channels, ours.out_channels, ours.kernel_size, stride)
+            layer = nn.ConvTranspose2d(
+                ours.in_channels, ours.out_channels, ours.kernel_size, stride
+            )
             layer.load_state_dict(ours.state_dict())
             autoencoder.decoder[place] = layer
         pictures = DataLoader(Pictures(rollouts, settings.stride), batch_sampler=batches)
     else:
         keep_freed_memory()
         autoencoder.to(memory_format=torch.channels_last)
-        pairs = read_ahead(lambda step: rollouts.pairs(batches[step], settings.stride), range(steps))
+        pairs = read_ahead(
+            lambda step: rollouts.pairs(batches[step], settings.stride), range(steps)
+        )
         pictures = (to_pictures(*pair) for _, pair in pairs)
-    optimizer = torch.optim.Adam(autoencoder.parameters(), lr=settings.v_learning_rate, fused=not plain)
+    optimizer = torch.optim.Adam(
+        autoencoder.parameters(), lr=settings.v_learning_rate, fused=not plain
+    )
     for step, (frame, difference) in enumerate(pictures):
         if step == WARM_UP:
             begin = time.perf_counter()
@@ -435,7 +519,9 @@ def train_v(plain: bool, width: int, folder: Path, seed: int, steps: int = V_STE
     with torch.no_grad():
         frame, difference = to_pictures(*rollouts.pairs(heldout[:500], settings.stride))
         zero = torch.zeros(len(frame), settings.latent_size)
-        return speed, autoencoder_losses(autoencoder, frame, difference, zero, settings)["total"].item()
+        return speed, autoencoder_losses(autoencoder, frame, difference, zero, settings)[
+            "total"
+        ].item()
 
 
 def train_m(plain: bool, seed: int, steps: int = M_STEPS, batch: int | None = None) -> float:
@@ -488,7 +574,9 @@ def measure_cluster(rounds: int) -> dict:
         executors = {"own processes, 1": one, "own processes, 2": two}
         executors |= {"Dask, 1 worker": dask_one, "Dask, 2 workers": dask_two}
         contenders = {
-            name: functools.partial(speed, executor, hand_out(executor, PRETRAINED / VARIANT, VARIANT))
+            name: functools.partial(
+                speed, executor, hand_out(executor, PRETRAINED / VARIANT, VARIANT)
+            )
             for name, executor in executors.items()
         }
         for contender in contenders.values():
@@ -501,10 +589,16 @@ def measure_cluster(rounds: int) -> dict:
             "frames a second, 16 in step": np.median(
                 [crowd_speed(one, agent.parameters, 16, settings) for _ in range(rounds)]
             ),
-            "milliseconds of Dask for a task": np.median([task_cost(dask_two) for _ in range(rounds)]),
-            "milliseconds of CMA-ES for a generation of 64": np.median([cma_cost() for _ in range(rounds)]),
+            "milliseconds of Dask for a task": np.median(
+                [task_cost(dask_two) for _ in range(rounds)]
+            ),
+            "milliseconds of CMA-ES for a generation of 64": np.median(
+                [cma_cost() for _ in range(rounds)]
+            ),
             "kilobytes of a task with one car": len(dumps(agent.parameters)) / 1e3,
-            "kilobytes of V and M, once for each worker": len(dumps(read_world_model(PRETRAINED / VARIANT, VARIANT)))
+            "kilobytes of V and M, once for each worker": len(
+                dumps(read_world_model(PRETRAINED / VARIANT, VARIANT))
+            )
             / 1e3,
         }
     tables["costs"] = {name: float(value) for name, value in costs.items()}
@@ -525,7 +619,9 @@ def task_cost(executor: Executor, count: int = 400) -> float:
 def cma_cost(generations: int = 5) -> float:
     """Milliseconds that CMA-ES takes to ask for 64 agents of 867 parameters and to be told their fitnesses."""
     with threadpool_limits(1):
-        strategy = make_strategy(initial_parameters(32, 256), Settings.preset("paper", population=64))
+        strategy = make_strategy(
+            initial_parameters(32, 256), Settings.preset("paper", population=64)
+        )
         begin = time.perf_counter()
         for _ in range(generations):
             population = np.array(strategy.ask())
@@ -533,7 +629,9 @@ def cma_cost(generations: int = 5) -> float:
         return 1e3 * (time.perf_counter() - begin) / generations
 
 
-def project(costs: dict[str, float], workers: int, episodes: int = 1024, frames: int = 1000) -> float:
+def project(
+    costs: dict[str, float], workers: int, episodes: int = 1024, frames: int = 1000
+) -> float:
     """Efficiency of so many workers: their speed-up over one, divided by their number.
 
     Episodes are independent, so they are shared out evenly, at most 16 in step. What one process must do for all comes
@@ -542,11 +640,14 @@ def project(costs: dict[str, float], workers: int, episodes: int = 1024, frames:
 
     def seconds(count: int) -> float:
         cars = min(16, episodes // count)  # that drive in step
-        alone, crowd = (costs[f"frames a second, {name}"] for name in ("1 car in a process", "16 in step"))
+        alone, crowd = (
+            costs[f"frames a second, {name}"] for name in ("1 car in a process", "16 in step")
+        )
         speed = alone + (crowd - alone) * (cars - 1) / 15  # between the two that were measured
         serial = costs["milliseconds of Dask for a task"] * episodes / cars
         return (
-            episodes / count * frames / speed + (serial + costs["milliseconds of CMA-ES for a generation of 64"]) / 1e3
+            episodes / count * frames / speed
+            + (serial + costs["milliseconds of CMA-ES for a generation of 64"]) / 1e3
         )
 
     return seconds(1) / (workers * seconds(workers))

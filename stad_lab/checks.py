@@ -9,7 +9,11 @@ import torch
 
 
 def check(
-    what: str, found: object, expected: object, mistakes: dict[str, object] | None = None, tolerance: float = 1e-4
+    what: str,
+    found: object,
+    expected: object,
+    mistakes: dict[str, object] | None = None,
+    tolerance: float = 1e-4,
 ) -> None:
     """Raise AssertionError with a diagnosis unless an answer is right; print that it is, if so.
 
@@ -25,13 +29,21 @@ def check(
         raise AssertionError(f"{what} is None: end your function with `return` and the result")
     if isinstance(found, torch.Tensor) and not isinstance(expected, torch.Tensor):
         remedy = (
-            "an array, which .numpy() makes of it" if np.ndim(expected) else "a number, which float(...) makes of it"
+            "an array, which .numpy() makes of it"
+            if np.ndim(expected)
+            else "a number, which float(...) makes of it"
         )
         raise AssertionError(f"{what} is a tensor: expected {remedy}")
-    if isinstance(found, str | dict) or (isinstance(expected, torch.Tensor) and not isinstance(found, torch.Tensor)):
-        raise AssertionError(f"{what} is of type {type(found).__name__}: expected {type(expected).__name__}")
+    if isinstance(found, str | dict) or (
+        isinstance(expected, torch.Tensor) and not isinstance(found, torch.Tensor)
+    ):
+        raise AssertionError(
+            f"{what} is of type {type(found).__name__}: expected {type(expected).__name__}"
+        )
     if isinstance(found, list | tuple) and isinstance(expected, np.ndarray):
-        raise AssertionError(f"{what} is a {type(found).__name__}: expected an array; wrap it in np.array(...)")
+        raise AssertionError(
+            f"{what} is a {type(found).__name__}: expected an array; wrap it in np.array(...)"
+        )
     found, expected = to_numpy(found), to_numpy(expected)
     if not agree(found, expected, tolerance):
         for hint, wrong in (mistakes or {}).items():
@@ -39,7 +51,9 @@ def check(
                 raise AssertionError(f"{what}: {hint} ({describe_difference(found, expected)})")
         raise AssertionError(f"{what}: {describe_difference(found, expected)}")
     if found.dtype.kind != expected.dtype.kind:
-        raise AssertionError(f"{what} has the right values, but dtype {found.dtype}: expected {expected.dtype}")
+        raise AssertionError(
+            f"{what} has the right values, but dtype {found.dtype}: expected {expected.dtype}"
+        )
     print(f"{what}: right")
 
 
@@ -48,8 +62,13 @@ def to_numpy(value: object) -> np.ndarray:
     try:
         return value.detach().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
     except ValueError as error:
-        raise AssertionError(f"this is no array, since its parts differ in length ({error})") from error
-    except (RuntimeError, TypeError) as error:  # a list of tensors that keep their gradients, for example
+        raise AssertionError(
+            f"this is no array, since its parts differ in length ({error})"
+        ) from error
+    except (
+        RuntimeError,
+        TypeError,
+    ) as error:  # a list of tensors that keep their gradients, for example
         raise AssertionError(f"this is no array, and cannot be made one: {error}") from error
 
 
@@ -58,7 +77,9 @@ def agree(found: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
     if found.shape != other.shape or found.dtype.kind not in "biuf":
         return False
     scale = max(1.0, float(np.abs(other[np.isfinite(other)], dtype=float).max(initial=0)))
-    return np.allclose(found.astype(float), other.astype(float), rtol=0, atol=tolerance * scale, equal_nan=True)
+    return np.allclose(
+        found.astype(float), other.astype(float), rtol=0, atol=tolerance * scale, equal_nan=True
+    )
 
 
 def describe_difference(found: np.ndarray, expected: np.ndarray) -> str:
@@ -76,7 +97,11 @@ def describe_difference(found: np.ndarray, expected: np.ndarray) -> str:
         )
     same = (found == expected) | np.isnan(found) & np.isnan(expected)
     with np.errstate(invalid="ignore"):  # of infinite numbers, which are the same or not
-        error = np.where(wanted, np.where(same, 0.0, np.inf), np.abs(found.astype(float) - expected.astype(float)))
+        error = np.where(
+            wanted,
+            np.where(same, 0.0, np.inf),
+            np.abs(found.astype(float) - expected.astype(float)),
+        )
     place = tuple(int(i) for i in np.unravel_index(np.argmax(error), error.shape))
     where = f" at index {place}" if place else ""
     return f"found {found[place]:.6g}{where}, expected {expected[place]:.6g}"

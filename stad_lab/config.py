@@ -198,12 +198,18 @@ def check_value(name: str, kind: type, value: object) -> None:
     if type(value) is not kind and not (kind is float and type(value) is int):
         raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
     if kind in (int, float):
-        lowest = AT_LEAST.get(name, 0 if name in (*NO_LESS_THAN_ZERO, *SHARES) else 1 if kind is int else 1e-12)
+        lowest = AT_LEAST.get(
+            name, 0 if name in (*NO_LESS_THAN_ZERO, *SHARES) else 1 if kind is int else 1e-12
+        )
         highest = AT_MOST.get(name, 1.0 if name in SHARES else 1e12)
         if not lowest <= value <= highest:
-            raise ValueError(f"{name}={value!r} is out of range: expected {lowest:g} to {highest:g}")
+            raise ValueError(
+                f"{name}={value!r} is out of range: expected {lowest:g} to {highest:g}"
+            )
     if name == "name" and value not in ("quick", "laptop", "paper"):
-        raise ValueError(f"name={value!r}: expected the preset that the settings began as, quick, laptop or paper")
+        raise ValueError(
+            f"name={value!r}: expected the preset that the settings began as, quick, laptop or paper"
+        )
     if name == "features" and value not in FEATURES:
         raise ValueError(f"features={value!r}: choose one of {', '.join(map(repr, FEATURES))}")
 

@@ -21,7 +21,18 @@ COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
 LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = (
-    *("numpy", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma", "sklearn", "scipy", "safetensors"),
+    *(
+        "numpy",
+        "cv2",
+        "torch",
+        "gymnasium",
+        "Box2D",
+        "pygame",
+        "cma",
+        "sklearn",
+        "scipy",
+        "safetensors",
+    ),
     *("matplotlib", "PIL", "ipywidgets"),
 )
 
@@ -57,7 +68,9 @@ class Report:
         counts = [(sum(line.state == state for line in self.lines), state) for state in COLORS]
         counted = ", ".join(f"{count} {state}" for count, state in counts if count)
         verdict = (
-            "everything needed is here" if self.ok else "follow the remedies of the red lines, then run this again"
+            "everything needed is here"
+            if self.ok
+            else "follow the remedies of the red lines, then run this again"
         )
         return f"{counted}: {verdict}"
 
@@ -79,7 +92,11 @@ class Report:
             remedy = f"<br><b>{escape(line.remedy)}</b>" if line.remedy else ""
             mark = f'<span style="color: {COLORS[line.state]}">&#9679;</span> {line.state}'
             cells = (mark, escape(line.name), escape(line.found) + remedy)
-            rows.append("<tr>" + "".join(f'<td style="text-align: left">{cell}</td>' for cell in cells) + "</tr>")
+            rows.append(
+                "<tr>"
+                + "".join(f'<td style="text-align: left">{cell}</td>' for cell in cells)
+                + "</tr>"
+            )
         opened = "" if all(line.state == GREEN for line in self.lines) else " open"
         return f"<details{opened}><summary>{escape(self.summary)}</summary><table>{''.join(rows)}</table></details>"
 
@@ -93,7 +110,14 @@ def check_environment(folder: str | Path = ".") -> Report:
     Args:
         folder: where you work: looked at for space and for the right to write.
     """
-    checks = (check_python, check_packages, check_imports, check_settings, check_weights, check_drive)
+    checks = (
+        check_python,
+        check_packages,
+        check_imports,
+        check_settings,
+        check_weights,
+        check_drive,
+    )
     checks += (check_processors, check_memory, check_gpu, check_widgets)
     lines = [line for check in checks for line in attempt(check)]
     return Report((*lines, *attempt(check_folder, Path(folder))))
@@ -130,7 +154,9 @@ def check_python() -> Iterator[Line]:
         yield Line(RED, "stad_lab", f"not installed for {sys.executable}", INSTALL)
         return
     yield Line(GREEN, "stad_lab", version("stad_lab"))
-    found = platform.python_version().rstrip("+")  # of a build from a branch, 3.12.3+: as good as 3.12.3
+    found = platform.python_version().rstrip(
+        "+"
+    )  # of a build from a branch, 3.12.3+: as good as 3.12.3
     yield compare("Python", found, wanted, f"make a new environment with a Python {wanted}")
 
 
@@ -152,7 +178,12 @@ def check_packages() -> Iterator[Line]:
     except PackageNotFoundError:
         return
     remedy = "pip uninstall box2d-py box2d, then " + INSTALL
-    yield Line(RED, "box2d-py", f"{found}, which is installed over the same module `Box2D` as box2d", remedy)
+    yield Line(
+        RED,
+        "box2d-py",
+        f"{found}, which is installed over the same module `Box2D` as box2d",
+        remedy,
+    )
 
 
 def compare(name: str, found: str, wanted: str, remedy: str) -> Line:
@@ -185,19 +216,28 @@ def check_settings() -> Iterator[Line]:
         yield Line(GREEN, "settings", Settings.preset().name)
     except ValueError as error:
         yield Line(
-            RED, "settings", str(error), f"set {ENVIRONMENT_VARIABLE} to one of {', '.join(PRESETS)}, or unset it"
+            RED,
+            "settings",
+            str(error),
+            f"set {ENVIRONMENT_VARIABLE} to one of {', '.join(PRESETS)}, or unset it",
         )
 
 
 def check_weights() -> Iterator[Line]:
     """The trained weights that come with stad_lab."""
     files = sorted(Path(__file__).with_name("pretrained").rglob("*.safetensors"))
-    small = [file.name for file in files if file.stat().st_size < 500]  # a pointer of Git LFS, or half a download
+    small = [
+        file.name for file in files if file.stat().st_size < 500
+    ]  # a pointer of Git LFS, or half a download
     if not files or small:
         found = f"truncated: {', '.join(small)}" if small else "none in stad_lab/pretrained"
         yield Line(RED, "weights", found, "download or clone the whole of stad_lab again")
     else:
-        yield Line(GREEN, "weights", f"{len(files)} files, {sum(file.stat().st_size for file in files) / 1e6:.0f} MB")
+        yield Line(
+            GREEN,
+            "weights",
+            f"{len(files)} files, {sum(file.stat().st_size for file in files) / 1e6:.0f} MB",
+        )
 
 
 def check_drive() -> Iterator[Line]:
@@ -214,25 +254,40 @@ def check_drive() -> Iterator[Line]:
         colors = len(np.unique(observation.reshape(-1, 3), axis=0))
         found = f"Box2D drives; picture {observation.shape}, {colors} colours, mean {observation.mean():.0f} of 255"
         black = observation.mean() < 10 or colors < 5
-        remedy = "reinstall the renderer: pip install --force-reinstall pygame-ce opencv-python-headless"
+        remedy = (
+            "reinstall the renderer: pip install --force-reinstall pygame-ce opencv-python-headless"
+        )
         yield Line(RED, name, found + ": black", remedy) if black else Line(GREEN, name, found)
 
 
 def check_processors() -> Iterator[Line]:
     """Processor cores that this process may use, and whether others keep them busy."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     limit = LIMITS / "cpu.max"
     quota, _, period = limit.read_text().partition(" ") if limit.exists() else ("max", "", "")
     allowed = max(1, int(quota) // int(period)) if quota.isdigit() else cores
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     remedy = "close other programs; on a shared machine, set OMP_NUM_THREADS=1 before you start JupyterLab"
-    if load > 2 * cores and os.environ.get("OMP_NUM_THREADS") != "1":  # PyTorch's threads then wait for each other
-        yield Line(AMBER, "cores", f"{cores}, and on average {load:.0f} processes want them", remedy)
-    elif allowed < cores and not os.environ.get("OMP_NUM_THREADS"):  # as many threads as cores, and few may run
+    if (
+        load > 2 * cores and os.environ.get("OMP_NUM_THREADS") != "1"
+    ):  # PyTorch's threads then wait for each other
+        yield Line(
+            AMBER, "cores", f"{cores}, and on average {load:.0f} processes want them", remedy
+        )
+    elif allowed < cores and not os.environ.get(
+        "OMP_NUM_THREADS"
+    ):  # as many threads as cores, and few may run
         remedy = f"set OMP_NUM_THREADS={allowed} before you start JupyterLab"
         yield Line(AMBER, "cores", f"{cores}, of which the container may use {allowed}", remedy)
     elif cores == 1:
-        yield Line(AMBER, "cores", "1", "all works, at half the stated speed or less: add --set processes=1 to train")
+        yield Line(
+            AMBER,
+            "cores",
+            "1",
+            "all works, at half the stated speed or less: add --set processes=1 to train",
+        )
     else:
         yield Line(GREEN, "cores", f"{cores}")
 
@@ -245,8 +300,15 @@ def check_memory() -> Iterator[Line]:
     limit, used, statistics = (LIMITS / f"memory.{name}" for name in ("max", "current", "stat"))
     if limit.exists() and limit.read_text().strip().isdigit():
         # Pages of files that were read count as used there, though the system gives them back when they are wanted.
-        counts = dict(line.split() for line in statistics.read_text().splitlines()) if statistics.exists() else {}
-        free = min(free, int(limit.read_text()) - int(used.read_text()) + int(counts.get("inactive_file", 0)))
+        counts = (
+            dict(line.split() for line in statistics.read_text().splitlines())
+            if statistics.exists()
+            else {}
+        )
+        free = min(
+            free,
+            int(limit.read_text()) - int(used.read_text()) + int(counts.get("inactive_file", 0)),
+        )
     remedy = "close other programs and shut down notebooks that you no longer use (Kernel > Shut Down All Kernels)"
     yield graded("free memory", free / 1e9, amber=2.0, red=0.7, remedy=remedy)
 
@@ -254,15 +316,27 @@ def check_memory() -> Iterator[Line]:
 def check_folder(folder: Path) -> Iterator[Line]:
     """Space on the disk of the working folder, and the right to write there."""
     if not folder.is_dir():
-        yield Line(RED, "working folder", f"{folder}: there is no such folder", "make it, or name another one")
+        yield Line(
+            RED,
+            "working folder",
+            f"{folder}: there is no such folder",
+            "make it, or name another one",
+        )
         return
     remedy = "make room, or work on another disk; random episodes of the laptop settings take up to 1.4 GB"
-    yield graded("free disk", shutil.disk_usage(folder).free / 1e9, amber=3.0, red=0.3, remedy=remedy)
+    yield graded(
+        "free disk", shutil.disk_usage(folder).free / 1e9, amber=3.0, red=0.3, remedy=remedy
+    )
     try:
         with tempfile.TemporaryFile(dir=folder):
             yield Line(GREEN, "working folder", "may be written to")
     except OSError as error:
-        yield Line(RED, "working folder", f"{folder.resolve()}: {error}", "copy the notebooks to a folder of your own")
+        yield Line(
+            RED,
+            "working folder",
+            f"{folder.resolve()}: {error}",
+            "copy the notebooks to a folder of your own",
+        )
 
 
 def graded(name: str, found: float, amber: float, red: float, remedy: str) -> Line:
@@ -285,24 +359,41 @@ def check_gpu() -> Iterator[Line]:
         built = [int(kind[3:].rstrip("af")) for kind in nvidia]
         if built and 10 * major + minor < min(built):
             remedy = "none is needed; for this one install a PyTorch that is built for an older CUDA, see pytorch.org"
-            yield Line(AMBER, "GPU", f"{name} is too old for this PyTorch: V and M train on the CPU", remedy)
+            yield Line(
+                AMBER,
+                "GPU",
+                f"{name} is too old for this PyTorch: V and M train on the CPU",
+                remedy,
+            )
             return
         torch.ones(1, device="cuda").add_(1).item()  # as `training.training_device` does
         yield Line(GREEN, "GPU", name)
     except (RuntimeError, AssertionError) as error:
         remedy = "none is needed; see whether another process has taken it"
-        yield Line(AMBER, "GPU", f"{name} cannot be used now, so V and M train on the CPU: {error}", remedy)
+        yield Line(
+            AMBER, "GPU", f"{name} cannot be used now, so V and M train on the CPU: {error}", remedy
+        )
 
 
 def check_widgets() -> Iterator[Line]:
     """Whether JupyterLab, if started from this environment, can show sliders."""
     from jupyter_core.paths import jupyter_path
 
-    folders = [Path(folder, "@jupyter-widgets", "jupyterlab-manager") for folder in jupyter_path("labextensions")]
+    folders = [
+        Path(folder, "@jupyter-widgets", "jupyterlab-manager")
+        for folder in jupyter_path("labextensions")
+    ]
     if any(folder.exists() for folder in folders):
-        yield Line(GREEN, "widgets", f"JupyterLab's widget manager {version('jupyterlab_widgets')} is installed")
-    else:
-        remedy = (
-            "pip install --force-reinstall jupyterlab_widgets, then start JupyterLab anew; the figures show without it"
+        yield Line(
+            GREEN,
+            "widgets",
+            f"JupyterLab's widget manager {version('jupyterlab_widgets')} is installed",
         )
-        yield Line(AMBER, "widgets", "JupyterLab's widget manager is missing: sliders stay invisible", remedy)
+    else:
+        remedy = "pip install --force-reinstall jupyterlab_widgets, then start JupyterLab anew; the figures show without it"
+        yield Line(
+            AMBER,
+            "widgets",
+            "JupyterLab's widget manager is missing: sliders stay invisible",
+            remedy,
+        )

@@ -4,9 +4,15 @@ import os
 
 os.environ.setdefault("STAD_LAB_SETTINGS", "quick")
 os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")  # a GPU does not repeat its sums bit for bit
-os.environ.setdefault("SDL_VIDEODRIVER", "dummy")  # check_env tries render_mode="human": no window may open
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # in kernels and commands too: the cores are shared by several tests
-os.environ.setdefault("TQDM_MININTERVAL", "1")  # a kernel's messages that nobody has read yet are dropped after 1,000
+os.environ.setdefault(
+    "SDL_VIDEODRIVER", "dummy"
+)  # check_env tries render_mode="human": no window may open
+os.environ.setdefault(
+    "OMP_NUM_THREADS", "1"
+)  # in kernels and commands too: the cores are shared by several tests
+os.environ.setdefault(
+    "TQDM_MININTERVAL", "1"
+)  # a kernel's messages that nobody has read yet are dropped after 1,000
 
 import functools
 import json
@@ -31,13 +37,17 @@ from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.io.files import save_tensors
 from stad_lab.models.controller import initial_parameters
 
-torch.set_num_threads(1)  # the models here are tiny: more threads would only get in each other's way
+torch.set_num_threads(
+    1
+)  # the models here are tiny: more threads would only get in each other's way
 
 
 def run_stad_lab(*arguments, **environment):
     """Run the real command line in a process of its own."""
     command = [sys.executable, "-m", "stad_lab", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300, env=os.environ | environment)
+    return subprocess.run(
+        command, capture_output=True, text=True, timeout=300, env=os.environ | environment
+    )
 
 
 # Python runs a module of this name at every start, so this watches the command and all of its workers.
@@ -81,7 +91,9 @@ def quick_training(tmp_path_factory, worker_id):
     """One run made by the real command: (its folder, the finished process, its duration in seconds)."""
     shared = tmp_path_factory.getbasetemp()
     if worker_id != "master":
-        shared = shared.parent  # of all processes of this test run: whoever comes first makes the run
+        shared = (
+            shared.parent
+        )  # of all processes of this test run: whoever comes first makes the run
     told = shared / "quick_training.json"
     with FileLock(shared / "quick_training.lock"):
         if not told.exists():
@@ -99,11 +111,22 @@ def train_quickly(folder, guard):
     (guard / "sitecustomize.py").write_text(GUARD)
     # PyTorch looks for a place for temporary files: in /dev/ and /proc/, too
     may_write = os.pathsep.join([str(folder), str(guard), "/dev/", "/proc/"])
-    guarded = {"GUARDED": may_write, "TMPDIR": str(guard), "PYTHONPATH": str(guard), "PYTHONDONTWRITEBYTECODE": "1"}
-    guarded["MPLCONFIGDIR"] = str(guard)  # matplotlib, which pycma imports, makes a folder for its own settings
-    guarded["TORCHINDUCTOR_CACHE_DIR"] = str(guard)  # a PyTorch that has trained in this process hands its own on
+    guarded = {
+        "GUARDED": may_write,
+        "TMPDIR": str(guard),
+        "PYTHONPATH": str(guard),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    guarded["MPLCONFIGDIR"] = str(
+        guard
+    )  # matplotlib, which pycma imports, makes a folder for its own settings
+    guarded["TORCHINDUCTOR_CACHE_DIR"] = str(
+        guard
+    )  # a PyTorch that has trained in this process hands its own on
     begin = time.perf_counter()
-    process = run_stad_lab("train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded)
+    process = run_stad_lab(
+        "train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded
+    )
     told = {name: getattr(process, name) for name in ("returncode", "stdout", "stderr")}
     return told | {"seconds": time.perf_counter() - begin}
 
@@ -120,10 +143,14 @@ def straight_run(quick_run, tmp_path_factory):
     folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("runs") / "straight")
     _, facts = load_controller(folder / "controller.safetensors", "input_output")
     quick = Settings.preset("quick")
-    straight = initial_parameters(quick.latent_size, quick.hidden_size, gas=-0.2)  # 0.4, were the driver blind
+    straight = initial_parameters(
+        quick.latent_size, quick.hidden_size, gas=-0.2
+    )  # 0.4, were the driver blind
     gas = straight[:-3].reshape(3, -1)[1]
     gas[:] = 0.02 * np.random.default_rng(0).standard_normal(gas.shape)
-    save_tensors(folder / "controller.safetensors", {"parameters": torch.from_numpy(straight)}, **facts)
+    save_tensors(
+        folder / "controller.safetensors", {"parameters": torch.from_numpy(straight)}, **facts
+    )
     return folder
 
 

@@ -39,7 +39,9 @@ def make_agent(variant="input_output", cars=None, stride=4, crop_bar=True):
     autoencoder, mdn_rnn = AutoEncoder(variant, 32, 4).eval(), MDNRNN(32, 16, 3).eval()
     autoencoder.encoder[-1].weight.data *= 10
     size = (parameter_count(32, 16),) if cars is None else (cars, parameter_count(32, 16))
-    return Agent(autoencoder, mdn_rnn, 0.3 * np.random.default_rng(0).standard_normal(size), stride, crop_bar)
+    return Agent(
+        autoencoder, mdn_rnn, 0.3 * np.random.default_rng(0).standard_normal(size), stride, crop_bar
+    )
 
 
 def act_along(agent, observations):
@@ -58,9 +60,14 @@ def test_actions_are_float32_within_bounds(agent, observations):
 
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_a_batch_of_cars_acts_like_single_ones(variant, observations):
-    alone = [act_along(make_agent(variant), observations[start : start + 12]) for start in (0, 20, 40)]
+    alone = [
+        act_along(make_agent(variant), observations[start : start + 12]) for start in (0, 20, 40)
+    ]
     agent = make_agent(variant)
-    together = [agent.act_batch(np.stack([observations[start + t] for start in (0, 20, 40)])) for t in range(12)]
+    together = [
+        agent.act_batch(np.stack([observations[start + t] for start in (0, 20, 40)]))
+        for t in range(12)
+    ]
     assert np.allclose(np.stack(alone, axis=1), together, atol=1e-5)
     assert np.std(alone[0], axis=0).max() > 1e-3  # and the actions are not all the same
 
@@ -177,7 +184,9 @@ for _ in range(5):
 print("drove")
 """
     (tmp_path / "script.py").write_text(script)
-    process = subprocess.run([sys.executable, tmp_path / "script.py"], capture_output=True, text=True, timeout=60)
+    process = subprocess.run(
+        [sys.executable, tmp_path / "script.py"], capture_output=True, text=True, timeout=60
+    )
     assert process.stdout == "drove\n", process.stderr
 
 
@@ -231,7 +240,11 @@ def test_patience_ends_an_episode_that_reaches_no_new_tile():
 
 @pytest.mark.parametrize(
     "observation",
-    [np.zeros((64, 64, 3), np.uint8), np.zeros((1, 96, 96, 3), np.uint8), np.zeros((96, 96, 3), np.float64)],
+    [
+        np.zeros((64, 64, 3), np.uint8),
+        np.zeros((1, 96, 96, 3), np.uint8),
+        np.zeros((96, 96, 3), np.float64),
+    ],
 )
 def test_an_observation_of_another_shape_or_dtype_is_refused(observation, agent):
     with pytest.raises(
@@ -244,7 +257,9 @@ def test_an_observation_of_another_shape_or_dtype_is_refused(observation, agent)
 
 def test_another_number_of_cars_is_refused(agent, observations):
     agent.act_batch(observations[:3])
-    with pytest.raises(ValueError, match=r"2 observations, expected 3, as in the step before: call agent.reset"):
+    with pytest.raises(
+        ValueError, match=r"2 observations, expected 3, as in the step before: call agent.reset"
+    ):
         agent.act_batch(observations[:2])
 
 
@@ -276,10 +291,15 @@ def test_the_stride_of_a_run_is_that_of_its_v_its_m_its_components_and_its_agent
     fit = mdn_rnn.fit_mdn_rnn
     monkeypatch.setattr(mdn_rnn, "fit_mdn_rnn", lambda *all: (given.append(all), fit(*all)))
     for stride in (4, 2):
-        settings, run = Settings.preset("quick", stride=stride, v_steps=2, m_steps=1), tmp_path / str(stride)
+        settings, run = (
+            Settings.preset("quick", stride=stride, v_steps=2, m_steps=1),
+            tmp_path / str(stride),
+        )
         train("input_output", settings, run, quick_run / "rollouts", until="mdn_rnn")
         weights[stride] = load_autoencoder(run / "autoencoder.safetensors")[0].state_dict()
-    assert not all(torch.equal(weights[2][name], weights[4][name]) for name in weights[2])  # V saw other differences
+    assert not all(
+        torch.equal(weights[2][name], weights[4][name]) for name in weights[2]
+    )  # V saw other differences
     world_model = read_world_model(run, "input_output")
     path, first = run / "controller.safetensors", initial_parameters(32, 24)
     save_controller(path, first, variant="input_output", **world_model.identities)
@@ -287,11 +307,15 @@ def test_the_stride_of_a_run_is_that_of_its_v_its_m_its_components_and_its_agent
     *_, encoded, actions, _, _ = given[-1]
     for episode, frames in enumerate(rollouts.frames):
         seen = encode_frames(agent.autoencoder, frames, 2)
-        assert np.array_equal(encoded[episode], seen) and np.array_equal(actions[episode], rollouts.actions[episode])
+        assert np.array_equal(encoded[episode], seen) and np.array_equal(
+            actions[episode], rollouts.actions[episode]
+        )
         assert np.array_equal(features(world_model, frames, actions[episode])[:, :32], seen[0])
     act_along(agent, observations[:4])
     frames = np.array([to_frame(observation, agent.crop_bar) for observation in observations[:4]])
-    assert np.allclose(agent.latents[0], encode_frames(agent.autoencoder, frames, 2)[0][-1], atol=1e-5)
+    assert np.allclose(
+        agent.latents[0], encode_frames(agent.autoencoder, frames, 2)[0][-1], atol=1e-5
+    )
 
 
 def test_a_number_of_cars_other_than_that_of_controllers_is_refused(observations):
@@ -305,7 +329,8 @@ def test_a_nan_action_never_reaches_the_car(observations):
     agent.mdn_rnn.lstm.bias_ih_l0.data.fill_(float("nan"))
     agent.act(observations[0])
     with pytest.raises(
-        ValueError, match=r"action \[.*nan.*\] before squashing, expected finite numbers: check z, h and C"
+        ValueError,
+        match=r"action \[.*nan.*\] before squashing, expected finite numbers: check z, h and C",
     ):
         agent.act(observations[1])
 
@@ -317,14 +342,17 @@ def test_parameters_of_another_size_are_refused():
 
 
 def test_an_unknown_variant_is_refused_with_the_choices(quick_run):
-    with pytest.raises(ValueError, match="unknown variant 'both': choose one of frame, input, output, input_output"):
+    with pytest.raises(
+        ValueError, match="unknown variant 'both': choose one of frame, input, output, input_output"
+    ):
         load_agent("both", quick_run)
 
 
 def test_a_missing_agent_is_an_error_that_names_the_command(tmp_path):
     for folder, problem in ((tmp_path, "is empty"), (tmp_path / "nowhere", "is not a folder")):
         with pytest.raises(
-            FileNotFoundError, match=f"{problem}: expected a run made by `python -m stad_lab train --var"
+            FileNotFoundError,
+            match=f"{problem}: expected a run made by `python -m stad_lab train --var",
         ):
             load_agent("frame", folder)
 
@@ -333,7 +361,10 @@ def test_a_variant_that_is_not_shipped_is_an_error_that_names_the_command(monkey
     (tmp_path / "input").mkdir()
     (tmp_path / "input" / "controller.safetensors").touch()
     monkeypatch.setattr("stad_lab.agent.PRETRAINED", tmp_path)
-    with pytest.raises(FileNotFoundError, match="no trained 'frame' agent comes with stad_lab, only input: train one"):
+    with pytest.raises(
+        FileNotFoundError,
+        match="no trained 'frame' agent comes with stad_lab, only input: train one",
+    ):
         load_agent("frame")
 
 
@@ -354,7 +385,9 @@ def test_a_truncated_file_is_an_error_that_names_it(part, quick_run, tmp_path):
     run = shutil.copytree(quick_run, tmp_path / "run")
     file = run / f"{part}.safetensors"
     file.write_bytes(file.read_bytes()[:-10])
-    with pytest.raises(ValueError, match=f"{part}.safetensors is damaged .*: delete it and train it: python -m"):
+    with pytest.raises(
+        ValueError, match=f"{part}.safetensors is damaged .*: delete it and train it: python -m"
+    ):
         load_agent("input_output", run)
 
 
@@ -364,7 +397,8 @@ def test_weights_that_stad_lab_did_not_write_are_refused(quick_run, tmp_path):
     run = shutil.copytree(quick_run, tmp_path / "run")
     save_file({"parameters": torch.zeros(195)}, run / "controller.safetensors")
     with pytest.raises(
-        ValueError, match=r"controller.safetensors was not written by stad_lab: give a file that `python"
+        ValueError,
+        match=r"controller.safetensors was not written by stad_lab: give a file that `python",
     ):
         load_agent("input_output", run)
 
@@ -373,26 +407,40 @@ def test_a_controller_is_read_as_it_was_written(tmp_path):
     parameters = np.random.default_rng(0).standard_normal(867)
     save_controller(tmp_path / "c.safetensors", parameters, variant="input")
     assert np.array_equal(load_controller(tmp_path / "c.safetensors", "input")[0], parameters)
-    with pytest.raises(ValueError, match="holds variant 'input', and 'frame' was asked for: give its own run"):
+    with pytest.raises(
+        ValueError, match="holds variant 'input', and 'frame' was asked for: give its own run"
+    ):
         load_controller(tmp_path / "c.safetensors", "frame")
 
 
-def test_a_shipped_agent_acts_almost_like_the_run_it_comes_from(quick_run, agent, observations, tmp_path):
+def test_a_shipped_agent_acts_almost_like_the_run_it_comes_from(
+    quick_run, agent, observations, tmp_path
+):
     shipped = load_agent("input_output", ship("input_output", quick_run, tmp_path))
-    assert np.allclose(act_along(shipped, observations[:12]), act_along(agent, observations[:12]), atol=1e-3)
-    sizes = [(folder / "autoencoder.safetensors").stat().st_size for folder in (tmp_path / "input_output", quick_run)]
+    assert np.allclose(
+        act_along(shipped, observations[:12]), act_along(agent, observations[:12]), atol=1e-3
+    )
+    sizes = [
+        (folder / "autoencoder.safetensors").stat().st_size
+        for folder in (tmp_path / "input_output", quick_run)
+    ]
     assert sizes[0] < 0.6 * sizes[1]
 
 
 def test_a_damaged_run_is_not_shipped_and_one_without_c_leaves_none_of_before(quick_run, tmp_path):
-    run, target = shutil.copytree(quick_run, tmp_path / "run"), ship("input_output", quick_run, tmp_path / "shipped")
+    run, target = (
+        shutil.copytree(quick_run, tmp_path / "run"),
+        ship("input_output", quick_run, tmp_path / "shipped"),
+    )
     (target / "evaluation.json").write_text("{}")  # of the agent that was shipped
     before = {file.name: file.read_bytes() for file in target.iterdir()}
     (run / "controller.safetensors").write_bytes(b"cut short")
     with pytest.raises(ValueError, match=r"controller\.safetensors is damaged"):
         ship("input_output", run, tmp_path / "shipped")
     assert {file.name: file.read_bytes() for file in target.iterdir()} == before
-    with pytest.raises(ValueError, match="is where agents are shipped to: give the folder of a run"):
+    with pytest.raises(
+        ValueError, match="is where agents are shipped to: give the folder of a run"
+    ):
         ship("input_output", target, tmp_path / "shipped")
     assert {file.name: file.read_bytes() for file in target.iterdir()} == before
     (run / "controller.safetensors").unlink()

@@ -40,7 +40,14 @@ def test_contenders_take_turns_in_alternating_order():
         return run
 
     table = take_turns({"slow": contender("slow", 10), "quick": contender("quick", 30)}, 3, "test")
-    assert calls == [(0, "slow"), (0, "quick"), (1, "quick"), (1, "slow"), (2, "slow"), (2, "quick")]
+    assert calls == [
+        (0, "slow"),
+        (0, "quick"),
+        (1, "quick"),
+        (1, "slow"),
+        (2, "slow"),
+        (2, "quick"),
+    ]
     assert table["slow"] == {"median": 20, "ratio": 1, "rounds": [10, 20, 30]}
     assert table["quick"] == {"median": 60, "ratio": 3, "rounds": [30, 60, 90]}
     assert "60    3.00x" in describe("frames a second", table)
@@ -49,7 +56,16 @@ def test_contenders_take_turns_in_alternating_order():
 def test_each_part_of_a_frame_takes_less_than_the_whole():
     budget = frame_budget(cars=2, frames=40)
     whole = budget.pop("together")
-    assert budget.keys() == {"physics", "reset", "picture", "preparation", "V", "M", "C", "all else"}
+    assert budget.keys() == {
+        "physics",
+        "reset",
+        "picture",
+        "preparation",
+        "V",
+        "M",
+        "C",
+        "all else",
+    }
     assert all(0 < budget[name] < whole for name in ("physics", "preparation", "V", "M", "C"))
 
 
@@ -57,11 +73,20 @@ def test_agents_drive_with_world_models_sizes(tmp_path):
     make_world_models_sizes(tmp_path)
     brief = Settings.preset("paper", max_frames=10)
     agent = load_agent(VARIANT)
-    assert read_world_model(tmp_path, VARIANT).autoencoder.width == brief.width > agent.autoencoder.width
+    assert (
+        read_world_model(tmp_path, VARIANT).autoencoder.width
+        == brief.width
+        > agent.autoencoder.width
+    )
     with ThreadPoolExecutor(1) as executor:
         population = np.repeat(agent.parameters[None], 2, axis=0)
         for tracks in (1, 2):
-            assert generation_speed(population, dataclasses.replace(brief, tracks=tracks), executor, tmp_path, 0) > 0
+            assert (
+                generation_speed(
+                    population, dataclasses.replace(brief, tracks=tracks), executor, tmp_path, 0
+                )
+                > 0
+            )
 
 
 @pytest.mark.long
@@ -94,21 +119,39 @@ def test_m_s_speed_is_measured():
 
 def test_the_command_writes_every_measurement(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("stad_lab.benchmark.MAX_FRAMES", 30)  # of an episode
-    assert main(["benchmark", "--part", "renderer", "--rounds", "1", "--json", str(tmp_path / "benchmark.json")]) == 0
+    assert (
+        main(
+            [
+                "benchmark",
+                "--part",
+                "renderer",
+                "--rounds",
+                "1",
+                "--json",
+                str(tmp_path / "benchmark.json"),
+            ]
+        )
+        == 0
+    )
     printed = capsys.readouterr().out
     result = json.loads((tmp_path / "benchmark.json").read_text(encoding="utf-8"))
     table = result["renderer"]["frames a second on one core"]
     assert {GYMNASIUM, FAST, PHYSICS} <= table.keys()
     assert all(len(row["rounds"]) == 1 and row["median"] > 0 for row in table.values())
     assert table[FAST]["ratio"] > 1
-    assert result["made_with"]["command"] == "python -m stad_lab benchmark --part renderer --rounds 1"
+    assert (
+        result["made_with"]["command"] == "python -m stad_lab benchmark --part renderer --rounds 1"
+    )
     assert f"{FAST}  " in printed
-    assert ("EnvPool is not installed" in printed) != any(name.startswith("EnvPool") for name in table)
+    assert ("EnvPool is not installed" in printed) != any(
+        name.startswith("EnvPool") for name in table
+    )
 
 
 @pytest.mark.parametrize(("parts", "rounds"), [(["speed"], 5), (["parity"], 0)])
 def test_an_unknown_part_or_no_round_is_refused(parts, rounds):
     with pytest.raises(
-        ValueError, match=r"choose from parity, renderer, loop, training, cluster, with 1 round or more"
+        ValueError,
+        match=r"choose from parity, renderer, loop, training, cluster, with 1 round or more",
     ):
         benchmark(parts, rounds)

@@ -15,14 +15,18 @@ from pathlib import Path
 
 import pytest
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
 if not CHROMIUM:
     pytest.skip(
         "no chromium on the PATH, so no widget is tried in a browser: install it (Debian: apt-get install chromium)",
         allow_module_level=True,
     )
 playwright = pytest.importorskip(
-    "playwright.sync_api", reason="no playwright: pip install -r environment.txt", exc_type=ImportError
+    "playwright.sync_api",
+    reason="no playwright: pip install -r environment.txt",
+    exc_type=ImportError,
 )
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
@@ -38,14 +42,30 @@ def lab(tmp_path_factory):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     quiet, dark = {"fetchNews": "false", "checkForUpdates": False}, {"theme": "JupyterLab Dark"}
-    places = {f"JUPYTER_{kind}_DIR": str(folder / kind) for kind in ("CONFIG", "RUNTIME")} | {"OMP_NUM_THREADS": "1"}
-    command = [sys.executable, "-m", "jupyterlab", "--no-browser", "--allow-root", f"--port={port}", "--ip=127.0.0.1"]
-    command += ["--IdentityProvider.token=t", f"--ServerApp.root_dir={folder}", "--ServerApp.port_retries=0"]
+    places = {f"JUPYTER_{kind}_DIR": str(folder / kind) for kind in ("CONFIG", "RUNTIME")} | {
+        "OMP_NUM_THREADS": "1"
+    }
+    command = [
+        sys.executable,
+        "-m",
+        "jupyterlab",
+        "--no-browser",
+        "--allow-root",
+        f"--port={port}",
+        "--ip=127.0.0.1",
+    ]
+    command += [
+        "--IdentityProvider.token=t",
+        f"--ServerApp.root_dir={folder}",
+        "--ServerApp.port_retries=0",
+    ]
     command += ["--LabApp.extension_manager=readonly"]
     settings = folder / "CONFIG" / "labconfig" / "default_setting_overrides.json"
     settings.parent.mkdir(parents=True)
     extension = "@jupyterlab/apputils-extension"
-    settings.write_text(json.dumps({f"{extension}:notification": quiet, f"{extension}:themes": dark}))
+    settings.write_text(
+        json.dumps({f"{extension}:notification": quiet, f"{extension}:themes": dark})
+    )
     with (folder / "server.log").open("w") as log:
         server = subprocess.Popen(
             command,
@@ -71,7 +91,9 @@ def lab(tmp_path_factory):
 def browser():
     """One Chromium for all tests."""
     with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS.split())
+        chromium = started.chromium.launch(
+            executable_path=CHROMIUM, headless=True, args=FLAGS.split()
+        )
         yield chromium
         chromium.close()
 
@@ -90,7 +112,10 @@ def run(lab, browser):
         page = browser.new_page(viewport={"width": 1300, "height": 1400})
         pages.append(page)
         page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+        page.on(
+            "console",
+            lambda message: errors.append(message.text) if message.type == "error" else None,
+        )
         page.goto(f"{address}/lab/workspaces/auto-{time.time_ns()}/tree/{name}?token=t")
         page.wait_for_selector(".jp-Notebook .jp-CodeCell")
         page.get_by_text("| Idle").wait_for(
@@ -110,7 +135,14 @@ def as_notebook(cells):
     """Code cells as a notebook."""
     kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
     made = [
-        {"cell_type": "code", "id": f"c{n}", "source": cell, "metadata": {}, "outputs": [], "execution_count": None}
+        {
+            "cell_type": "code",
+            "id": f"c{n}",
+            "source": cell,
+            "metadata": {},
+            "outputs": [],
+            "execution_count": None,
+        }
         for n, cell in enumerate(cells)
     ]
     return {"cells": made, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
@@ -166,10 +198,14 @@ LIGHTS = r"""pre => {
 }"""
 
 
-def test_source_code_can_be_read_in_the_dark_theme_and_a_moved_slider_draws_another_figure_in_every_widget(run):
+def test_source_code_can_be_read_in_the_dark_theme_and_a_moved_slider_draws_another_figure_in_every_widget(
+    run,
+):
     page = run(SOURCE, *SLIDERS)  # one page for both: a kernel takes seconds to start
     cells = page.locator(".jp-CodeCell")
-    paper, *inks = cells.first.locator(".jp-OutputArea-output pre").last.evaluate(LIGHTS, timeout=1000 * SLOW)
+    paper, *inks = cells.first.locator(".jp-OutputArea-output pre").last.evaluate(
+        LIGHTS, timeout=1000 * SLOW
+    )
     assert page.locator("body").get_attribute("data-jp-theme-light") == "false"
     assert min(paper) > 240 and len(inks) > 20
     assert max(sum(ink) / 3 for ink in inks) < 175
@@ -197,7 +233,10 @@ COUNT = """picture => { window.pictures = 0; new MutationObserver(() => { window
 
 def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(run):
     page = run(SEAT)
-    picture, status = page.locator(".stad-lab-pixels"), page.locator(".widget-html", has_text="frame")
+    picture, status = (
+        page.locator(".stad-lab-pixels"),
+        page.locator(".widget-html", has_text="frame"),
+    )
 
     def tells(text, seconds=SLOW):
         wait_for(lambda: text in status.first.inner_text(), text, seconds)
@@ -217,7 +256,9 @@ def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(r
     time.sleep(2)
     rate = (page.evaluate("window.pictures") - before) / (time.monotonic() - begin)
     print(f"{rate:.1f} pictures a second arrive in the browser; load {os.getloadavg()[0]:.1f}")
-    assert rate > 5  # a machine busy with other tests is slow; the line above says how fast this one was
+    assert (
+        rate > 5
+    )  # a machine busy with other tests is slow; the line above says how fast this one was
     page.mouse.move(5, 5)  # the pointer leaves with the key down: the pedal is let go
     tells("keys held: none")
     picture.hover()
@@ -240,7 +281,9 @@ def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(r
         picture.hover()
         page.keyboard.press("p")
     tells("paused")
-    assert page.locator(".jp-CodeCell").count() == 1  # no key that drives was taken for a command of JupyterLab
+    assert (
+        page.locator(".jp-CodeCell").count() == 1
+    )  # no key that drives was taken for a command of JupyterLab
 
 
 LIVE = """

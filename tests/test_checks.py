@@ -28,20 +28,32 @@ def test_a_right_answer_passes_and_says_so(capsys):
         (np.array([0.5, np.nan, 3.0]), "found 1 numbers that are not finite"),
         (RIGHT + 0.001 * np.eye(3)[1], r"found -1.999 at index \(1,\), expected -2"),
         (np.array(["a", "b", "c"]), "found dtype <U1, expected numbers"),
-        (-RIGHT, r"f.x.: the sign .*found -3 at index \(2,\), expected 3|f.x.: the sign .*found 2 at"),
+        (
+            -RIGHT,
+            r"f.x.: the sign .*found -3 at index \(2,\), expected 3|f.x.: the sign .*found 2 at",
+        ),
         (np.full(2, np.nan), "two NaN"),
     ],
 )
 def test_a_wrong_answer_is_told_what_is_wrong(found, message):
     with pytest.raises(AssertionError, match=message):
-        check("f(x)", found, RIGHT, {"the sign is turned round": -RIGHT, "two NaN": np.full(2, np.nan)})
+        check(
+            "f(x)",
+            found,
+            RIGHT,
+            {"the sign is turned round": -RIGHT, "two NaN": np.full(2, np.nan)},
+        )
 
 
 @pytest.mark.parametrize(
     ("found", "expected", "message"),
     [
         ([1.0, 2.0], [1.0, np.nan], "found 0 numbers that are not finite .*expected 1$"),
-        ([np.nan, 2.0], [1.0, np.nan], "found 1 numbers that are not finite .*expected 1, elsewhere"),
+        (
+            [np.nan, 2.0],
+            [1.0, np.nan],
+            "found 1 numbers that are not finite .*expected 1, elsewhere",
+        ),
         ([np.inf, np.inf], [np.nan, np.nan], r"found inf at index \(0,\), expected nan"),
         ([1.0, np.inf], [1.0, np.nan], r"found inf at index \(1,\), expected nan"),
         ([1.0, -np.inf], [1.0, np.inf], r"found -inf at index \(1,\), expected inf"),
@@ -54,7 +66,9 @@ def test_answers_that_are_not_finite_are_told_what_is_wrong(found, expected, mes
 
 
 def test_a_list_of_tensors_that_keep_their_gradients_is_told_so():
-    with pytest.raises(AssertionError, match=r"this is no array, and cannot be made one: .*requires grad"):
+    with pytest.raises(
+        AssertionError, match=r"this is no array, and cannot be made one: .*requires grad"
+    ):
         check("the answer", [torch.ones(2, requires_grad=True)], [[1.0, 1.0]])
 
 

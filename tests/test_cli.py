@@ -38,7 +38,10 @@ def run(quick_run, tmp_path):
 def states(folder):
     """Bytes and time of the last change of every file under a folder."""
     files = [path for path in folder.rglob("*") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): (path.read_bytes(), path.stat().st_mtime_ns) for path in files}
+    return {
+        path.relative_to(folder).as_posix(): (path.read_bytes(), path.stat().st_mtime_ns)
+        for path in files
+    }
 
 
 def evaluate_quickly(folder, variant="input_output"):
@@ -76,7 +79,11 @@ def test_a_run_leaves_weights_log_and_record(quick_training):
     assert record["seconds"].keys() == {"rollouts", "autoencoder", "mdn_rnn", "controller"}
     assert record["peak_memory"].keys() == record["seconds"].keys()
     if sys.platform != "win32":
-        assert all(50 < peak < 3000 for (stage,) in record["peak_memory"].values() for peak in stage.values())
+        assert all(
+            50 < peak < 3000
+            for (stage,) in record["peak_memory"].values()
+            for peak in stage.values()
+        )
     assert record["made_with"]["torch"] == importlib.metadata.version("torch")
     assert record["budget"]["random"] == {"episodes": 8, "frames": 8 * 60}
     assert record["budget"]["agents"] == record["budget"]["evolution"]["episodes"] == 4 * 4
@@ -95,10 +102,15 @@ def test_the_second_run_of_a_command_does_nothing_and_says_so(run, capsys):
     assert [name for name in after if after[name][1] != before[name][1]] == []
 
 
-def test_a_budget_that_a_kill_left_behind_is_counted_again_and_a_later_start_by_other_means_is_told(run, capsys):
+def test_a_budget_that_a_kill_left_behind_is_counted_again_and_a_later_start_by_other_means_is_told(
+    run, capsys
+):
     whole = load_json(run / "record.json")
     old = whole["made_with"] | {"commit": "an earlier one"}
-    save_json(run / "record.json", whole | {"budget": {"random": whole["budget"]["random"]}, "made_with": old})
+    save_json(
+        run / "record.json",
+        whole | {"budget": {"random": whole["budget"]["random"]}, "made_with": old},
+    )
     for _ in range(2):
         assert main([str(argument) for argument in train_quickly(run)]) == 0
         record = load_json(run / "record.json")
@@ -111,15 +123,39 @@ def test_a_budget_that_a_kill_left_behind_is_counted_again_and_a_later_start_by_
     [
         (
             "train",
-            ["--variant", "--settings", "--out", "--rollouts", "--until", "--set", *VARIANTS, *PRESETS, "mdn_rnn"],
+            [
+                "--variant",
+                "--settings",
+                "--out",
+                "--rollouts",
+                "--until",
+                "--set",
+                *VARIANTS,
+                *PRESETS,
+                "mdn_rnn",
+            ],
         ),
-        ("evaluate", ["--variant", "--path", "--episodes", "--first-track", "--fast", "--processes", "--json"]),
+        (
+            "evaluate",
+            [
+                "--variant",
+                "--path",
+                "--episodes",
+                "--first-track",
+                "--fast",
+                "--processes",
+                "--json",
+            ],
+        ),
         ("benchmark", ["--part", "--rounds", "--json", "parity", "renderer", "loop", "training"]),
         ("ship", ["--variant", "--path"]),
         ("table", ["--records", "--picture"]),
         ("film", ["--variant", "--path", "--out", "--track", "--first", "--frames", "--viewer"]),
         ("probe", ["--variant", "--path", "--drives", "--processes", "--json"]),
-        ("study", ["--settings", "--out", "--rollouts", "--part", "probe", "autoencoder", "mdn_rnn"]),
+        (
+            "study",
+            ["--settings", "--out", "--rollouts", "--part", "probe", "autoencoder", "mdn_rnn"],
+        ),
     ],
 )
 def test_help_names_every_option(command, options, capsys):
@@ -127,7 +163,9 @@ def test_help_names_every_option(command, options, capsys):
         main([command, "--help"])
     assert exit.value.code == 0
     text = capsys.readouterr().out
-    assert [one for one in options if not re.search(rf"(?<![\w-]){re.escape(one)}(?![\w-])", text)] == []
+    assert [
+        one for one in options if not re.search(rf"(?<![\w-]){re.escape(one)}(?![\w-])", text)
+    ] == []
 
 
 COMMANDS = [
@@ -171,7 +209,13 @@ def test_every_option_has_a_sentence_in_the_help(command):
 
 
 def test_until_stops_after_a_stage_and_set_changes_a_setting(tmp_path, capsys):
-    arguments = [*train_quickly(tmp_path, variant="frame"), "--until", "rollouts", "--set", "stride=2"]
+    arguments = [
+        *train_quickly(tmp_path, variant="frame"),
+        "--until",
+        "rollouts",
+        "--set",
+        "stride=2",
+    ]
     arguments += ["--set", "episodes=2", "--set", "crop_bar=false", "--set", "kl_weight=0.5"]
     assert main([str(argument) for argument in arguments]) == 0
     assert "rollouts: done" in capsys.readouterr().out
@@ -192,7 +236,19 @@ def test_the_command_in_a_record_asks_for_the_settings_of_that_record():
 @pytest.mark.parametrize(("name", "options"), [("drive.gif", []), ("drive.webp", ["--viewer"])])
 def test_a_film_is_a_moving_picture(name, options, quick_run, tmp_path, capsys):
     file = tmp_path / name
-    arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", file, "--first", 20, "--frames", 12]
+    arguments = [
+        "film",
+        "--variant",
+        "input_output",
+        "--path",
+        quick_run,
+        "--out",
+        file,
+        "--first",
+        20,
+        "--frames",
+        12,
+    ]
     assert main([str(argument) for argument in (*arguments, *options)]) == 0
     assert f"filmed to {file}" in capsys.readouterr().out
     with Image.open(file) as film:
@@ -204,7 +260,17 @@ def test_a_film_is_a_moving_picture(name, options, quick_run, tmp_path, capsys):
 
 def test_a_number_too_large_for_any_machine_ends_in_one_line(quick_run, tmp_path, capsys):
     file = tmp_path / "evaluation.json"
-    command = ["evaluate", "--variant", "input_output", "--path", quick_run, "--json", file, "--processes", 2**31]
+    command = [
+        "evaluate",
+        "--variant",
+        "input_output",
+        "--path",
+        quick_run,
+        "--json",
+        file,
+        "--processes",
+        2**31,
+    ]
     assert main([str(argument) for argument in command]) == 2
     assert "error: too large for this machine: " in capsys.readouterr().err and not file.exists()
 
@@ -231,9 +297,18 @@ def test_a_number_may_be_written_as_people_write_it():
 
 
 def test_every_command_line_of_the_pages_is_one():
-    pages = [page.read_text(encoding="utf-8") for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))]
-    blocks = [block for page in pages for block in re.findall(r"^```sh\n(.*?)^```", page, re.M | re.S)]
-    lines = [line for block in blocks for line in re.findall(r"^\S*python -m stad_lab (.*)$", block, re.M)]
+    pages = [
+        page.read_text(encoding="utf-8")
+        for page in (ROOT / "README.md", *(ROOT / "docs").glob("*.md"))
+    ]
+    blocks = [
+        block for page in pages for block in re.findall(r"^```sh\n(.*?)^```", page, re.M | re.S)
+    ]
+    lines = [
+        line
+        for block in blocks
+        for line in re.findall(r"^\S*python -m stad_lab (.*)$", block, re.M)
+    ]
     for line in lines:
         build_parser().parse_args(shlex.split(line, comments=True))
     assert len(lines) > 15
@@ -259,15 +334,27 @@ def test_a_film_of_no_frame_is_refused_before_the_drive(agent):
         (
             "train",
             "--variant input --settings quick --out run --rollouts shared --earlier first --until mdn_rnn",
-            ("input", Settings.preset("quick"), Path("run"), Path("shared"), "mdn_rnn", None, Path("first")),
+            (
+                "input",
+                Settings.preset("quick"),
+                Path("run"),
+                Path("shared"),
+                "mdn_rnn",
+                None,
+                Path("first"),
+            ),
         ),
         ("ship", "--variant frame --path run", ("frame", Path("run"))),
         ("keep", "--row one_round --out table --seeds 1 2 --keep", ("one_round", Path("table"))),
     ],
 )
-def test_every_option_of_a_command_reaches_what_it_is_for(does, arguments, given, monkeypatch, capsys):
+def test_every_option_of_a_command_reaches_what_it_is_for(
+    does, arguments, given, monkeypatch, capsys
+):
     told = []
-    monkeypatch.setattr(f"stad_lab.__main__.{does}", lambda *all, **named: told.append((all, named)) or ["here"])
+    monkeypatch.setattr(
+        f"stad_lab.__main__.{does}", lambda *all, **named: told.append((all, named)) or ["here"]
+    )
     command = "replicate" if does == "keep" else does
     assert main([command, *arguments.split()]) == 0
     assert told == [(given, {"seeds": [1, 2]} if does == "keep" else {})]
@@ -280,10 +367,13 @@ def test_every_option_of_a_command_reaches_what_it_is_for(does, arguments, given
         "finish --variant input --out run --set earlier=x",
     ],
 )
-def test_a_setting_that_is_none_to_change_ends_in_one_clear_line(command, tmp_path, monkeypatch, capsys):
+def test_a_setting_that_is_none_to_change_ends_in_one_clear_line(
+    command, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert re.search(
-        "the name cannot be set; choose a preset|unknown setting 'earlier'", the_error(capsys, command.split())
+        "the name cannot be set; choose a preset|unknown setting 'earlier'",
+        the_error(capsys, command.split()),
     )
     assert not any(tmp_path.iterdir())
 
@@ -295,14 +385,31 @@ def test_a_result_is_written_where_it_is_wanted_and_not_over_a_folder(run, tmp_p
     capsys.readouterr()
     error = the_error(capsys, [*evaluate_quickly(run), "--json", wanted.parent])
     assert "is a folder: give the name of a file" in error
-    if hasattr(os, "mkfifo"):  # a device would be replaced by a file, for every program on the machine
+    if hasattr(
+        os, "mkfifo"
+    ):  # a device would be replaced by a file, for every program on the machine
         os.mkfifo(tmp_path / "device")
         error = the_error(capsys, [*evaluate_quickly(run), "--json", tmp_path / "device"])
-        assert "is no ordinary file: give the name of a file" in error and (tmp_path / "device").is_fifo()
+        assert (
+            "is no ordinary file: give the name of a file" in error
+            and (tmp_path / "device").is_fifo()
+        )
 
 
-def test_a_start_that_was_refused_may_be_made_again_with_other_settings(tmp_path, monkeypatch, capsys):
-    command = ["train", "--variant", "frame", "--settings", "quick", "--until", "rollouts", "--out", str(tmp_path)]
+def test_a_start_that_was_refused_may_be_made_again_with_other_settings(
+    tmp_path, monkeypatch, capsys
+):
+    command = [
+        "train",
+        "--variant",
+        "frame",
+        "--settings",
+        "quick",
+        "--until",
+        "rollouts",
+        "--out",
+        str(tmp_path),
+    ]
     monkeypatch.setattr("shutil.disk_usage", lambda folder: SimpleNamespace(free=1000))
     assert "collect fewer or shorter episodes" in the_error(capsys, command)
     monkeypatch.undo()
@@ -317,7 +424,9 @@ def test_a_folder_whose_letters_the_console_lacks_is_no_error(quick_run, tmp_pat
     run = shutil.copytree(quick_run, tmp_path / "\u0141\u00f3d\u017a")
     console = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
     monkeypatch.setattr(sys, "stdout", console)
-    assert main(["train", "--variant", "input_output", "--settings", "quick", "--out", str(run)]) == 0
+    assert (
+        main(["train", "--variant", "input_output", "--settings", "quick", "--out", str(run)]) == 0
+    )
     console.flush()
     assert b"nothing to do" in console.buffer.getvalue() and b"\\u0141" in console.buffer.getvalue()
 
@@ -334,7 +443,10 @@ def test_damaged_weights_end_in_one_clear_line(run, capsys):
     file = run / "mdn_rnn.safetensors"
     file.write_bytes(file.read_bytes()[:1000])
     error = the_error(capsys, evaluate_quickly(run))
-    assert f"{file} is damaged" in error and "delete it and train it: python -m stad_lab train --help" in error
+    assert (
+        f"{file} is damaged" in error
+        and "delete it and train it: python -m stad_lab train --help" in error
+    )
     assert not (run / "evaluation.json").exists()
 
 
@@ -347,7 +459,9 @@ def test_a_run_folder_of_other_settings_ends_in_one_clear_line(run, capsys):
 
 
 def test_an_unknown_preset_ends_in_one_clear_line(tmp_path, capsys):
-    error = the_error(capsys, ["train", "--variant", "input", "--settings", "fast", "--out", tmp_path / "run"])
+    error = the_error(
+        capsys, ["train", "--variant", "input", "--settings", "fast", "--out", tmp_path / "run"]
+    )
     assert "unknown settings 'fast': choose one of quick, laptop, paper" in error
 
 
@@ -356,7 +470,8 @@ def test_an_unknown_stage_or_setting_ends_in_one_clear_line(options, tmp_path, c
     error = the_error(capsys, train_quickly(tmp_path / "run", *options))
     assert repr(options[1].split("=")[0]) in error
     assert any(
-        remedy in error for remedy in ("choose one of rollouts", "the settings are name,", "expected NAME=VALUE")
+        remedy in error
+        for remedy in ("choose one of rollouts", "the settings are name,", "expected NAME=VALUE")
     )
 
 
@@ -372,7 +487,9 @@ def test_an_unknown_stage_or_setting_ends_in_one_clear_line(options, tmp_path, c
     ],
 )
 def test_a_wrong_value_of_a_setting_ends_in_one_clear_line(change, shown, tmp_path, capsys):
-    error = the_error(capsys, train_quickly(tmp_path / "run", "--until", "rollouts", "--set", change))
+    error = the_error(
+        capsys, train_quickly(tmp_path / "run", "--until", "rollouts", "--set", change)
+    )
     assert change.split("=")[0] in error
     assert shown in error
     assert "expected" in error
@@ -386,18 +503,25 @@ def test_a_missing_or_empty_run_folder_ends_in_one_clear_line(made, tmp_path, ca
         folder.mkdir()
     error = the_error(capsys, evaluate_quickly(folder, "input"))
     assert f"{folder} is {'empty' if made else 'not a folder'}" in error
-    assert f"expected a run made by `python -m stad_lab train --variant input --out {folder}`" in error
+    assert (
+        f"expected a run made by `python -m stad_lab train --variant input --out {folder}`" in error
+    )
 
 
 def test_an_unfinished_run_ends_in_one_clear_line(run, capsys):
     (run / "controller.safetensors").unlink()
     error = the_error(capsys, evaluate_quickly(run))
-    assert f"{run / 'controller.safetensors'} does not exist: train it: python -m stad_lab train --help" in error
+    assert (
+        f"{run / 'controller.safetensors'} does not exist: train it: python -m stad_lab train --help"
+        in error
+    )
 
 
 def test_an_out_that_is_a_file_ends_in_one_clear_line(tmp_path, capsys):
     (tmp_path / "file").touch()
-    assert str(tmp_path / "file") in the_error(capsys, train_quickly(tmp_path / "file", "--until", "rollouts"))
+    assert str(tmp_path / "file") in the_error(
+        capsys, train_quickly(tmp_path / "file", "--until", "rollouts")
+    )
 
 
 @pytest.mark.parametrize("command", [evaluate_quickly, train_quickly])
@@ -410,17 +534,27 @@ def test_a_run_of_another_variant_ends_in_one_clear_line(command, run, capsys):
 
 
 def test_weights_of_another_variant_end_in_one_clear_line(run, capsys):
-    save_autoencoder(run / "autoencoder.safetensors", AutoEncoder("frame", 32, 8), PRESETS["quick"], [])
+    save_autoencoder(
+        run / "autoencoder.safetensors", AutoEncoder("frame", 32, 8), PRESETS["quick"], []
+    )
     for arguments in (evaluate_quickly(run), train_quickly(run)):
         error = the_error(capsys, arguments)
-        assert f"{run / 'autoencoder.safetensors'} holds variant 'frame', and 'input_output' was asked for" in error
+        assert (
+            f"{run / 'autoencoder.safetensors'} holds variant 'frame', and 'input_output' was asked for"
+            in error
+        )
         assert "give its own run" in error
 
 
 def test_v_of_another_size_ends_in_one_clear_line(run, capsys):
-    save_autoencoder(run / "autoencoder.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
+    save_autoencoder(
+        run / "autoencoder.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], []
+    )
     error = the_error(capsys, evaluate_quickly(run))
-    assert "mdn_rnn.safetensors was made with another autoencoder than the one beside it: give V, M and C" in error
+    assert (
+        "mdn_rnn.safetensors was made with another autoencoder than the one beside it: give V, M and C"
+        in error
+    )
 
 
 def test_c_of_another_size_ends_in_one_clear_line(run, capsys):
@@ -433,10 +567,14 @@ def test_c_of_another_size_ends_in_one_clear_line(run, capsys):
 @pytest.mark.parametrize("part", ["autoencoder", "mdn_rnn"])
 def test_training_on_top_of_weights_of_another_size_ends_in_one_clear_line(part, run, capsys):
     if part == "autoencoder":
-        save_autoencoder(run / f"{part}.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], [])
+        save_autoencoder(
+            run / f"{part}.safetensors", AutoEncoder("input_output", 16, 8), PRESETS["quick"], []
+        )
         (run / "mdn_rnn.safetensors").unlink()
     else:
-        save_mdn_rnn(run / f"{part}.safetensors", MDNRNN(16, 24, 5), "input_output", PRESETS["quick"], [])
+        save_mdn_rnn(
+            run / f"{part}.safetensors", MDNRNN(16, 24, 5), "input_output", PRESETS["quick"], []
+        )
     (run / "controller.safetensors").unlink()
     (run / "evolution.json").unlink()
     error = the_error(capsys, train_quickly(run))
@@ -463,7 +601,9 @@ def test_a_rollout_file_cut_short_ends_in_one_clear_line(run, capsys):
     assert "collect again" in error
 
 
-@pytest.mark.parametrize("options", [["--episodes", "0"], ["--first-track", "-5"], ["--processes", "0"]])
+@pytest.mark.parametrize(
+    "options", [["--episodes", "0"], ["--first-track", "-5"], ["--processes", "0"]]
+)
 def test_a_wrong_number_ends_in_one_clear_line(options, run, capsys):
     error = the_error(capsys, [*evaluate_quickly(run), *options])
     assert f"{options[0].strip('-').replace('-', '_')}={options[1]}" in error
@@ -483,14 +623,32 @@ def test_a_film_that_cannot_be_made_is_refused_before_the_drive(
     options, message, quick_run, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", "drive.gif", *options]
+    arguments = [
+        "film",
+        "--variant",
+        "input_output",
+        "--path",
+        quick_run,
+        "--out",
+        "drive.gif",
+        *options,
+    ]
     assert main([str(argument) for argument in arguments]) == 2
     assert message in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
 
 
 def test_a_film_of_another_kind_is_refused_before_the_drive(quick_run, tmp_path, capsys):
-    arguments = ["film", "--variant", "input_output", "--path", quick_run, "--out", tmp_path / "drive.mp4", "--viewer"]
+    arguments = [
+        "film",
+        "--variant",
+        "input_output",
+        "--path",
+        quick_run,
+        "--out",
+        tmp_path / "drive.mp4",
+        "--viewer",
+    ]
     assert main([str(argument) for argument in arguments]) == 2
     assert "error: kind='mp4': expected 'gif' or 'webp'" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())

@@ -34,7 +34,9 @@ def test_the_environment_variable_names_the_preset(monkeypatch):
 
 def test_a_wrong_environment_variable_is_an_error(monkeypatch):
     monkeypatch.setenv("STAD_LAB_SETTINGS", "huge")
-    with pytest.raises(ValueError, match="unknown settings 'huge': choose one of quick, laptop, paper"):
+    with pytest.raises(
+        ValueError, match="unknown settings 'huge': choose one of quick, laptop, paper"
+    ):
         Settings.preset()
 
 
@@ -54,20 +56,27 @@ def test_settings_cannot_be_changed_by_accident():
 
 
 def test_an_unknown_preset_is_refused_with_the_choices():
-    with pytest.raises(ValueError, match="unknown settings 'fast': choose one of quick, laptop, paper"):
+    with pytest.raises(
+        ValueError, match="unknown settings 'fast': choose one of quick, laptop, paper"
+    ):
         Settings.preset("fast")
 
 
 def test_a_preset_keeps_its_name():
     with pytest.raises(
-        ValueError, match="name='laptop' of the settings 'quick': the name cannot be set; choose a preset with"
+        ValueError,
+        match="name='laptop' of the settings 'quick': the name cannot be set; choose a preset with",
     ):
         Settings.preset("quick", name="laptop")
 
 
-@pytest.mark.parametrize("make", [lambda: Settings.preset("quick", strid=2), lambda: Settings.from_dict({"strid": 2})])
+@pytest.mark.parametrize(
+    "make", [lambda: Settings.preset("quick", strid=2), lambda: Settings.from_dict({"strid": 2})]
+)
 def test_an_unknown_field_is_refused_with_the_choices(make):
-    with pytest.raises(ValueError, match=r"unknown setting 'strid': the settings are name, seed, .*stride"):
+    with pytest.raises(
+        ValueError, match=r"unknown setting 'strid': the settings are name, seed, .*stride"
+    ):
         make()
 
 
@@ -106,14 +115,21 @@ def test_a_wrong_value_is_refused_with_its_name_and_what_was_expected(field, val
 
 
 def test_values_that_do_not_go_together_are_refused():
-    with pytest.raises(ValueError, match=r"m_sequence=100 does not fit .*episode_frames=80: use at most 79"):
+    with pytest.raises(
+        ValueError, match=r"m_sequence=100 does not fit .*episode_frames=80: use at most 79"
+    ):
         Settings(episode_frames=80)
-    with pytest.raises(ValueError, match=r"episode_frames=20, but with stride=30 .*use more than 30 frames"):
+    with pytest.raises(
+        ValueError, match=r"episode_frames=20, but with stride=30 .*use more than 30 frames"
+    ):
         Settings(episode_frames=20, stride=30, m_sequence=5)
-    with pytest.raises(ValueError, match=r"generations=54 is not a multiple of validate_every=5: the last"):
+    with pytest.raises(
+        ValueError, match=r"generations=54 is not a multiple of validate_every=5: the last"
+    ):
         Settings(generations=54)
     with pytest.raises(
-        ValueError, match=r"sigma_decay=0\.5 shrinks sigma=.* in 55 generations: use .* nearer to 1, or 0"
+        ValueError,
+        match=r"sigma_decay=0\.5 shrinks sigma=.* in 55 generations: use .* nearer to 1, or 0",
     ):
         Settings(sigma_decay=0.5)
 

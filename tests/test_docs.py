@@ -21,8 +21,8 @@ from stad_lab.viz.widgets import show
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
-import gallery  # noqa: E402
-from site_check import faults  # noqa: E402
+import gallery
+from site_check import faults
 
 CELLS = (
     "from matplotlib.figure import Figure\nfrom stad_lab.viz.widgets import explore, show, slider\n"
@@ -36,11 +36,20 @@ def site(tmp_path_factory):
     """The site built from a copy of its sources and one small notebook that runs: (its folder, the process)."""
     source = tmp_path_factory.mktemp("source")
     for folder in ("docs", "notebooks"):
-        shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("_*", "rooms", ".ipynb_*"))
+        shutil.copytree(
+            ROOT / folder, source / folder, ignore=shutil.ignore_patterns("_*", "rooms", ".ipynb_*")
+        )
     shutil.copy(ROOT / "README.md", source)
     cells = [{"cell_type": "markdown", "metadata": {}, "source": "# Small\n\n$$\\alpha_t = x^2$$"}]
     cells += [
-        {"cell_type": "code", "metadata": {}, "source": cell, "outputs": [], "execution_count": None} for cell in CELLS
+        {
+            "cell_type": "code",
+            "metadata": {},
+            "source": cell,
+            "outputs": [],
+            "execution_count": None,
+        }
+        for cell in CELLS
     ]
     notebook = {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 4}
     (source / "notebooks" / "small.ipynb").write_text(json.dumps(notebook))
@@ -73,7 +82,14 @@ def test_the_figure_of_a_cell_is_what_a_reader_of_the_notebook_sees(tmp_path, mo
     figure.set_label("an empty square")
     source = f"from IPython.display import HTML\nHTML({show(figure).data!r})"  # a kernel that imports PyTorch is slow
     cells = [
-        {"id": "7-2", "cell_type": "code", "metadata": {}, "source": source, "outputs": [], "execution_count": None}
+        {
+            "id": "7-2",
+            "cell_type": "code",
+            "metadata": {},
+            "source": source,
+            "outputs": [],
+            "execution_count": None,
+        }
     ]
     notebook = {"cells": cells, "metadata": {}, "nbformat": 4, "nbformat_minor": 5}
     (tmp_path / "7-_small.ipynb").write_text(json.dumps(notebook))
@@ -92,9 +108,15 @@ def test_every_notebook_and_every_room_has_its_page_and_the_search_its_index(sit
     notebooks = {file.stem for file in (ROOT / "notebooks").glob("*.ipynb")}
     rooms = {file.stem for file in (ROOT / "stad_lab").glob("*.py")} - {"__init__", "__main__"}
     assert notebooks <= {file.stem for file in (folder / "notebooks").glob("*.html")}
-    assert rooms == {file.stem.removeprefix("stad_lab.") for file in (folder / "docs" / "rooms").glob("*.html")}
-    assert "load_agent" in (folder / "docs" / "rooms" / "stad_lab.agent.html").read_text(encoding="utf-8")
-    assert "notebooks/02_difference_autoencoders" in (folder / "searchindex.js").read_text(encoding="utf-8")
+    assert rooms == {
+        file.stem.removeprefix("stad_lab.") for file in (folder / "docs" / "rooms").glob("*.html")
+    }
+    assert "load_agent" in (folder / "docs" / "rooms" / "stad_lab.agent.html").read_text(
+        encoding="utf-8"
+    )
+    assert "notebooks/02_difference_autoencoders" in (folder / "searchindex.js").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_a_notebook_that_runs_shows_its_figure_and_a_note_where_its_widget_stood(site):
@@ -118,5 +140,10 @@ def test_the_check_finds_what_no_page_may_have(tmp_path):
     )
     found = faults(tmp_path)
     assert len(found) == 4
-    for what in ("without alternative text", "a place that is not there", "a file that is not there", "the network"):
+    for what in (
+        "without alternative text",
+        "a place that is not there",
+        "a file that is not there",
+        "the network",
+    ):
         assert sum(what in fault for fault in found) == 1

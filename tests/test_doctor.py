@@ -23,7 +23,13 @@ def check_in_a_process(*options, **variables):
     """`python -m stad_lab check` in a process of its own."""
     command = [sys.executable, *options, "-m", "stad_lab", "check"]
     return subprocess.run(
-        command, cwd=ROOT, env=os.environ | variables, capture_output=True, text=True, timeout=120, check=False
+        command,
+        cwd=ROOT,
+        env=os.environ | variables,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
     )
 
 
@@ -35,7 +41,15 @@ def line(report, name):
 def test_where_everything_is_installed_nothing_is_red(tmp_path):
     report = check_environment(tmp_path)
     assert report.ok, report
-    for name in ("Python", "torch", "gymnasium", "CarRacing, fast", "CarRacing, Gymnasium's", "working folder", "GPU"):
+    for name in (
+        "Python",
+        "torch",
+        "gymnasium",
+        "CarRacing, fast",
+        "CarRacing, Gymnasium's",
+        "working folder",
+        "GPU",
+    ):
         assert line(report, name).state == "green"
     assert all(bool(line.remedy) == (line.state != "green") for line in report.lines)
 
@@ -43,7 +57,10 @@ def test_where_everything_is_installed_nothing_is_red(tmp_path):
 def test_the_command_prints_one_line_for_each_check_and_succeeds():
     process = check_in_a_process()
     assert process.returncode == 0, process.stdout + process.stderr
-    assert {text.split()[0] for text in process.stdout.splitlines()[:-1]} - {"remedy:"} <= {"green", "amber"}
+    assert {text.split()[0] for text in process.stdout.splitlines()[:-1]} - {"remedy:"} <= {
+        "green",
+        "amber",
+    }
     assert "everything needed is here" in process.stdout
 
 
@@ -51,11 +68,16 @@ def test_a_library_that_does_not_load_is_a_red_line_and_the_rest_is_still_checke
     (tmp_path / "torch.py").write_text(
         "raise OSError('libgomp.so.1: cannot open “shared” object file')", encoding="utf-8"
     )
-    process = check_in_a_process(PYTHONPATH=str(tmp_path), PYTHONIOENCODING="ascii")  # a console without such letters
+    process = check_in_a_process(
+        PYTHONPATH=str(tmp_path), PYTHONIOENCODING="ascii"
+    )  # a console without such letters
     assert process.returncode == 1 and process.stderr == ""
     lines = process.stdout.splitlines()
     broken = next(number for number, text in enumerate(lines) if "import torch" in text)
-    assert lines[broken].startswith("red") and r"libgomp.so.1: cannot open \u201cshared" in lines[broken]
+    assert (
+        lines[broken].startswith("red")
+        and r"libgomp.so.1: cannot open \u201cshared" in lines[broken]
+    )
     assert "remedy: pip install -r environment.txt" in lines[broken + 1]
     assert any(text.startswith("green  CarRacing, fast") for text in lines)
 
@@ -86,7 +108,10 @@ def test_a_black_picture_is_red(monkeypatch):
     black = np.zeros((96, 96, 3), np.uint8)
     monkeypatch.setattr("stad_lab.envs.car_racing.FastCarRacing._render", lambda self, mode: black)
     report = environment.Report(tuple(environment.check_drive()))
-    assert line(report, "CarRacing, fast").state == "red" and "black" in line(report, "CarRacing, fast").found
+    assert (
+        line(report, "CarRacing, fast").state == "red"
+        and "black" in line(report, "CarRacing, fast").found
+    )
     assert line(report, "CarRacing, Gymnasium's").state == "green"
 
 
@@ -102,12 +127,19 @@ def test_a_working_folder_that_is_missing_or_read_only_is_red(tmp_path, monkeypa
 
 
 def test_little_room_is_amber_and_none_is_red():
-    states = [environment.graded("free disk", found, amber=3, red=1, remedy="make room").state for found in (4, 2, 0.5)]
+    states = [
+        environment.graded("free disk", found, amber=3, red=1, remedy="make room").state
+        for found in (4, 2, 0.5)
+    ]
     assert states == ["green", "amber", "red"]
 
 
 def test_in_a_container_files_that_were_read_do_not_count_as_used_memory(tmp_path, monkeypatch):
-    numbers = {"max": "3000000000\n", "current": "2900000000\n", "stat": "anon 5\ninactive_file 2800000000\n"}
+    numbers = {
+        "max": "3000000000\n",
+        "current": "2900000000\n",
+        "stat": "anon 5\ninactive_file 2800000000\n",
+    }
     for name, text in numbers.items():
         (tmp_path / f"memory.{name}").write_text(text)
     monkeypatch.setattr(environment, "LIMITS", tmp_path)
@@ -116,7 +148,9 @@ def test_in_a_container_files_that_were_read_do_not_count_as_used_memory(tmp_pat
     assert line.state == "green" and line.found.startswith("2.9")
 
 
-def test_fewer_cores_by_a_container_s_limit_are_amber_unless_the_threads_are_set(tmp_path, monkeypatch):
+def test_fewer_cores_by_a_container_s_limit_are_amber_unless_the_threads_are_set(
+    tmp_path, monkeypatch
+):
     (tmp_path / "cpu.max").write_text("200000 100000\n")
     monkeypatch.setattr(environment, "LIMITS", tmp_path)
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(64)), raising=False)
@@ -137,7 +171,9 @@ def test_a_gpu_that_is_too_old_for_this_pytorch_is_amber_and_not_trained_on(monk
 
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setattr("torch.cuda.get_device_name", lambda: "Tesla V100")
-    monkeypatch.setattr("torch.cuda.get_arch_list", lambda: ["sm_90a", "sm_75", "sm_100", "compute_120"])
+    monkeypatch.setattr(
+        "torch.cuda.get_arch_list", lambda: ["sm_90a", "sm_75", "sm_100", "compute_120"]
+    )
     monkeypatch.setattr("torch.ones", refuse)
     monkeypatch.setattr("torch.cuda.get_device_capability", lambda: (7, 0))
     (gpu,) = environment.check_gpu()
@@ -153,7 +189,9 @@ def test_a_gpu_that_is_too_old_for_this_pytorch_is_amber_and_not_trained_on(monk
 
 
 @pytest.mark.parametrize("refusing", ["torch.ones", "torch.cuda.get_device_name"])
-def test_a_gpu_that_another_process_has_taken_is_amber_because_none_is_needed(refusing, monkeypatch):
+def test_a_gpu_that_another_process_has_taken_is_amber_because_none_is_needed(
+    refusing, monkeypatch
+):
     def refuse(*given, **named):
         raise RuntimeError("CUDA error: all CUDA-capable devices are busy or unavailable")
 
@@ -166,7 +204,9 @@ def test_a_gpu_that_another_process_has_taken_is_amber_because_none_is_needed(re
 
 
 def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):
-    assert next(environment.check_weights()).found.startswith(f"{len(list(PRETRAINED.rglob('*.safetensors')))} files")
+    assert next(environment.check_weights()).found.startswith(
+        f"{len(list(PRETRAINED.rglob('*.safetensors')))} files"
+    )
     cut = tmp_path / "pretrained" / "second_round" / "frame" / "mdn_rnn.safetensors"
     cut.parent.mkdir(parents=True)
     cut.write_bytes(b"version https://git-lfs.github.com/spec/v1")
@@ -178,11 +218,17 @@ def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):
 def test_an_unknown_preset_is_red_and_names_the_presets(monkeypatch):
     monkeypatch.setenv("STAD_LAB_SETTINGS", "lapptop")
     (wrong,) = environment.check_settings()
-    assert wrong.state == "red" and "lapptop" in wrong.found and "quick, laptop, paper" in wrong.remedy
+    assert (
+        wrong.state == "red" and "lapptop" in wrong.found and "quick, laptop, paper" in wrong.remedy
+    )
 
 
 def test_in_a_notebook_the_remedies_stand_open_and_all_green_is_one_folded_line():
     green, red = environment.Line("green", "a", "1"), environment.Line("red", "b", "<2>", "do this")
-    assert environment.Report((green,))._repr_html_().startswith("<details><summary>1 green: everything")
+    assert (
+        environment.Report((green,))
+        ._repr_html_()
+        .startswith("<details><summary>1 green: everything")
+    )
     page = environment.Report((green, red))._repr_html_()
     assert page.startswith("<details open>") and "do this" in page and "&lt;2&gt;" in page

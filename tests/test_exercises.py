@@ -21,7 +21,8 @@ NOTEBOOKS = [*SOURCES.values(), *(COURSE / f"{name}.ipynb" for name in NAMES)]
 def read_cells(path):
     """The cells of a notebook, their sources joined."""
     return [
-        cell | {"source": "".join(cell["source"])} for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]
+        cell | {"source": "".join(cell["source"])}
+        for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]
     ]
 
 
@@ -77,7 +78,9 @@ def copy_answers(path):
 
 def open_gradebook(root):
     """nbgrader's book of the marks of a course."""
-    from nbgrader.api import Gradebook  # takes seconds: every process of the tests reads this file, one needs it
+    from nbgrader.api import (
+        Gradebook,
+    )  # takes seconds: every process of the tests reads this file, one needs it
 
     return Gradebook(f"sqlite:///{root / 'gradebook.db'}")
 
@@ -86,7 +89,9 @@ def scores(root, name, student):
     """The marks of an assignment: cell -> nbgrader's grade."""
     with open_gradebook(root) as gradebook:
         submission = gradebook.find_submission_notebook(name, name, student)
-        return {grade.name: (grade.auto_score, grade.max_score_gradecell) for grade in submission.grades}
+        return {
+            grade.name: (grade.auto_score, grade.max_score_gradecell) for grade in submission.grades
+        }
 
 
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
@@ -101,9 +106,15 @@ def test_autograde_gives_the_solution_full_marks_and_the_stub_none(graded):
 
 
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
-def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(graded, monkeypatch, capsys):
+def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(
+    graded, monkeypatch, capsys
+):
     root, name = graded
-    points = {grading(cell)["grade_id"]: grading(cell) for cell in read_cells(SOURCES[name]) if grading(cell)["grade"]}
+    points = {
+        grading(cell)["grade_id"]: grading(cell)
+        for cell in read_cells(SOURCES[name])
+        if grading(cell)["grade"]
+    }
     machine = sum(cell["points"] for cell in points.values() if not cell["solution"])
     read_by_hand = next(grade_id for grade_id, cell in points.items() if cell["solution"])
     with open_gradebook(root) as gradebook:
@@ -121,7 +132,10 @@ def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(graded
 def test_the_marks_of_an_unknown_assignment_end_in_one_line(graded, tmp_path, monkeypatch):
     root, name = graded
     unknown = f"no assignment '01' in gradebook.db: choose one of {name}"
-    for folder, asked, told in ((root, "01", unknown), (tmp_path, name, "no gradebook.db in .*: go to the folder")):
+    for folder, asked, told in (
+        (root, "01", unknown),
+        (tmp_path, name, "no gradebook.db in .*: go to the folder"),
+    ):
         monkeypatch.chdir(folder)
         monkeypatch.setattr("sys.argv", ["marks.py", asked])
         with pytest.raises(SystemExit, match=told):
@@ -149,8 +163,13 @@ def test_a_warning_or_a_progress_bar_under_a_check_costs_no_points():
     line, *others = [found[0] for found in lines if found]
     assert others == [line] * (len(NAMES) - 1)
     noise = "import sys, warnings\nfrom tqdm import tqdm\nwarnings.warn('careful')\nlist(tqdm(range(2)))"
-    grade = {"nbgrader": {"grade": True, "solution": False, "grade_id": "a", "points": 3, "locked": True}}
-    cells = [nbformat.v4.new_code_cell(f"import sys\n{line}"), nbformat.v4.new_code_cell(noise, metadata=grade)]
+    grade = {
+        "nbgrader": {"grade": True, "solution": False, "grade_id": "a", "points": 3, "locked": True}
+    }
+    cells = [
+        nbformat.v4.new_code_cell(f"import sys\n{line}"),
+        nbformat.v4.new_code_cell(noise, metadata=grade),
+    ]
     points = []
     for some in (cells, cells[1:]):
         notebook = nbformat.v4.new_notebook(cells=some)
@@ -162,10 +181,14 @@ def test_a_warning_or_a_progress_bar_under_a_check_costs_no_points():
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
 def test_every_cell_of_the_solution_runs(graded):
     root, name = graded
-    notebook = json.loads((root / "autograded" / "solution" / name / f"{name}.ipynb").read_text(encoding="utf-8"))
+    notebook = json.loads(
+        (root / "autograded" / "solution" / name / f"{name}.ipynb").read_text(encoding="utf-8")
+    )
     outputs = [output for cell in notebook["cells"] for output in cell.get("outputs", [])]
     assert [output["evalue"] for output in outputs if output["output_type"] == "error"] == []
-    pictures = [output["data"]["text/html"] for output in outputs if "text/html" in output.get("data", {})]
+    pictures = [
+        output["data"]["text/html"] for output in outputs if "text/html" in output.get("data", {})
+    ]
     assert len(pictures) == sum("show(" in cell["source"] for cell in read_cells(SOURCES[name])) > 0
     assert all(re.search('alt="[^"]{20,}"', "".join(picture)) for picture in pictures)
 
@@ -174,9 +197,9 @@ def test_the_student_versions_are_what_one_command_makes_of_the_sources(generato
     made = generator.generate(tmp_path)
     assert [path.stem for path in made] == NAMES
     for path in made:
-        assert path.read_text(encoding="utf-8") == (COURSE / path.name).read_text(encoding="utf-8"), (
-            "run notebooks/exercises/generate.py"
-        )
+        assert path.read_text(encoding="utf-8") == (COURSE / path.name).read_text(
+            encoding="utf-8"
+        ), "run notebooks/exercises/generate.py"
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: f"{path.parent.name}/{path.stem}")
@@ -186,8 +209,13 @@ def test_exercises_are_committed_clean(path):
     nbformat.validate(nbformat.from_dict(notebook))
     assert text == json.dumps(notebook, indent=1, ensure_ascii=False) + "\n"
     ids = [cell["id"] for cell in notebook["cells"]]
-    assert all(re.fullmatch(rf"{path.stem[:2]}-\d\d", name) for name in ids) and len(set(ids)) == len(ids)
-    assert all(cell.get("outputs", []) == [] and cell.get("execution_count") is None for cell in notebook["cells"])
+    assert all(re.fullmatch(rf"{path.stem[:2]}-\d\d", name) for name in ids) and len(
+        set(ids)
+    ) == len(ids)
+    assert all(
+        cell.get("outputs", []) == [] and cell.get("execution_count") is None
+        for cell in notebook["cells"]
+    )
     if path.parent == COURSE:
         assert "SOLUTION" not in text and "Model answer" not in text
 
@@ -206,8 +234,13 @@ def test_points_in_the_table_are_those_that_nbgrader_gives(name):
         if grading(cell)["grade"]:
             points[exercise] += grading(cell)["points"]
     assert points == table and len(table) >= 4
-    rubric = re.search(r"\| rubric \| points \|\n.*\n((\|.*\n?)+)", "\n\n".join(cell["source"] for cell in cells))
-    assert sum(int(row) for row in re.findall(r"\| (\d+) \|$", rubric[1], re.MULTILINE)) == table[max(table)]
+    rubric = re.search(
+        r"\| rubric \| points \|\n.*\n((\|.*\n?)+)", "\n\n".join(cell["source"] for cell in cells)
+    )
+    assert (
+        sum(int(row) for row in re.findall(r"\| (\d+) \|$", rubric[1], re.MULTILINE))
+        == table[max(table)]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -221,8 +254,14 @@ def moments():
             names = {}
             for cell in read_cells(SOURCES[name]):
                 cell_grading = grading(cell)
-                needed = cell_grading["grade_id"] or re.search(r"^(def|import|from) ", cell["source"], re.MULTILINE)
-                if cell["cell_type"] != "code" or not needed or (cell_grading["grade"] and cell_grading["solution"]):
+                needed = cell_grading["grade_id"] or re.search(
+                    r"^(def|import|from) ", cell["source"], re.MULTILINE
+                )
+                if (
+                    cell["cell_type"] != "code"
+                    or not needed
+                    or (cell_grading["grade"] and cell_grading["solution"])
+                ):
                     continue
                 if cell_grading["grade"]:
                     found[name[:2], cell_grading["grade_id"]] = dict(names), cell["source"]
@@ -245,15 +284,30 @@ WRONG = [
         "differences = lambda film, k: (film.astype(np.float32) - np.roll(film, k, axis=0)) / 255",
         "counts from the film's end",
     ),
-    ("01", "differences-values", "differences = lambda film, k: -episode_differences(film, k)", "sign is turned"),
-    ("01", "differences-start", "differences = lambda film, k: episode_differences(film, k) + 1", "found 1 at index"),
+    (
+        "01",
+        "differences-values",
+        "differences = lambda film, k: -episode_differences(film, k)",
+        "sign is turned",
+    ),
+    (
+        "01",
+        "differences-start",
+        "differences = lambda film, k: episode_differences(film, k) + 1",
+        "found 1 at index",
+    ),
     (
         "01",
         "differences-start",
         "differences = lambda film, k: np.zeros(film.shape)",
         "dtype float64: expected float32",
     ),
-    ("01", "differences-start", "differences = lambda film, k: episode_differences(film, 4)", "stride is not used"),
+    (
+        "01",
+        "differences-start",
+        "differences = lambda film, k: episode_differences(film, 4)",
+        "stride is not used",
+    ),
     (
         "01",
         "find-motion-made-up",
@@ -290,9 +344,24 @@ WRONG = [
         "    return min(wrap, key=wrap.get)",
         "rows from 48 on",
     ),
-    ("01", "find-motion-made-up", "find_motion = lambda x, y, turns, forwards: turns[0]", "expected two numbers"),
-    ("01", "find-motion-real", "find_motion = lambda x, y, turns, forwards: (0.0, 3.6)", "yaw rate 0.00 .*, truth 3"),
-    ("01", "find-motion-real", "find_motion = lambda x, y, turns, forwards: (0.31, 0.0)", "speed 0.0, truth 4"),
+    (
+        "01",
+        "find-motion-made-up",
+        "find_motion = lambda x, y, turns, forwards: turns[0]",
+        "expected two numbers",
+    ),
+    (
+        "01",
+        "find-motion-real",
+        "find_motion = lambda x, y, turns, forwards: (0.0, 3.6)",
+        "yaw rate 0.00 .*, truth 3",
+    ),
+    (
+        "01",
+        "find-motion-real",
+        "find_motion = lambda x, y, turns, forwards: (0.31, 0.0)",
+        "speed 0.0, truth 4",
+    ),
     (
         "01",
         "interval-check",
@@ -316,7 +385,12 @@ WRONG = [
         "    return np.percentile([rng.choice(own, len(own)).mean() for _ in range(resamples)], [2.5, 97.5])",
         "mean of every unit's own correlation",
     ),
-    ("02", "kl-values", "kl = lambda mu, logvar: (mu**2 + logvar.exp() - 1 - logvar).sum(1)", "1/2 is missing"),
+    (
+        "02",
+        "kl-values",
+        "kl = lambda mu, logvar: (mu**2 + logvar.exp() - 1 - logvar).sum(1)",
+        "1/2 is missing",
+    ),
     (
         "02",
         "kl-values",
@@ -335,10 +409,30 @@ WRONG = [
         "kl = lambda mu, v: 0.5 * ((mu**2 + 1) / v.exp() - 1 + v).sum(1)",
         "diverges from q",
     ),
-    ("02", "kl-values", "kl = lambda mu, logvar: 0.5 * (mu**2 + logvar.exp() - 1 - logvar)", "each latent by itself"),
-    ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v.exp() * noise", "the variance"),
-    ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + v * noise", "is a logarithm"),
-    ("02", "reparameterise-values", "reparameterise = lambda mu, v, noise: mu + (v / 2).exp()", "no noise in it"),
+    (
+        "02",
+        "kl-values",
+        "kl = lambda mu, logvar: 0.5 * (mu**2 + logvar.exp() - 1 - logvar)",
+        "each latent by itself",
+    ),
+    (
+        "02",
+        "reparameterise-values",
+        "reparameterise = lambda mu, v, noise: mu + v.exp() * noise",
+        "the variance",
+    ),
+    (
+        "02",
+        "reparameterise-values",
+        "reparameterise = lambda mu, v, noise: mu + v * noise",
+        "is a logarithm",
+    ),
+    (
+        "02",
+        "reparameterise-values",
+        "reparameterise = lambda mu, v, noise: mu + (v / 2).exp()",
+        "no noise in it",
+    ),
     (
         "02",
         "reparameterise-values",
@@ -351,7 +445,12 @@ WRONG = [
         "reparameterise = lambda mu, v, noise: (mu + (v / 2).exp() * noise).detach()",
         "no gradient comes back",
     ),
-    ("02", "active-check", "active = lambda kl: np.flatnonzero(kl.mean(0) > 0.05)", "order of the numbers"),
+    (
+        "02",
+        "active-check",
+        "active = lambda kl: np.flatnonzero(kl.mean(0) > 0.05)",
+        "order of the numbers",
+    ),
     ("02", "active-check", "active = lambda kl: kl.mean(0) > 0.05", "numbers of those"),
     (
         "02",
@@ -365,9 +464,24 @@ WRONG = [
         "solved = active\nactive = lambda kl, threshold=0.05: solved(kl)",
         "threshold is not used",
     ),
-    ("02", "active-check", "active = lambda kl: torch.tensor([3, 0, 1])", "expected an array, which .numpy"),
-    ("02", "silence-check", "def silence(z, latents): z[:, latents] = 0; return z", "changed the z"),
-    ("02", "silence-check", "def silence(z, latents): z = z.clone(); z[[1]] = 0; return z", "you silenced pictures"),
+    (
+        "02",
+        "active-check",
+        "active = lambda kl: torch.tensor([3, 0, 1])",
+        "expected an array, which .numpy",
+    ),
+    (
+        "02",
+        "silence-check",
+        "def silence(z, latents): z[:, latents] = 0; return z",
+        "changed the z",
+    ),
+    (
+        "02",
+        "silence-check",
+        "def silence(z, latents): z = z.clone(); z[[1]] = 0; return z",
+        "you silenced pictures",
+    ),
     (
         "02",
         "reaction-check",
@@ -389,7 +503,12 @@ WRONG = [
         "solved = reaction\ndef reaction(*given): return torch.tensor(solved(*given))",
         "expected a number, which float",
     ),
-    ("02", "reaction-check", "solved = reaction\ndef reaction(*given): return 1 / solved(*given)", "upside down"),
+    (
+        "02",
+        "reaction-check",
+        "solved = reaction\ndef reaction(*given): return 1 / solved(*given)",
+        "upside down",
+    ),
     (
         "02",
         "reaction-check",
@@ -486,9 +605,19 @@ WRONG = [
         "solved = moments\nmoments = lambda p, m, s: solved(p, m, s / 2)",
         "its square exp",
     ),
-    ("03", "moments-check", "solved = moments\nmoments = lambda p, m, s: solved(p, m, s)[0]", "return mean, deviation"),
+    (
+        "03",
+        "moments-check",
+        "solved = moments\nmoments = lambda p, m, s: solved(p, m, s)[0]",
+        "return mean, deviation",
+    ),
     ("03", "moments-check", "moments = lambda p, m, s: 1.0", "return mean, deviation"),
-    ("03", "moments-check", "moments = lambda p, m, s: (m.mean(-1), s.mean(-1))", "weigh each mean"),
+    (
+        "03",
+        "moments-check",
+        "moments = lambda p, m, s: (m.mean(-1), s.mean(-1))",
+        "weigh each mean",
+    ),
     (
         "03",
         "horizon-check",
@@ -559,7 +688,12 @@ WRONG = [
         "    return np.percentile([horizon(dream[one], constant[other]) for one, other in drawn], [2.5, 97.5])",
         "draw the drives once, for both",
     ),
-    ("04", "weights-check", "weights = lambda n: np.log(n // 2 + 0.5) - np.log(np.arange(1, n // 2 + 1))", "sum to 1"),
+    (
+        "04",
+        "weights-check",
+        "weights = lambda n: np.log(n // 2 + 0.5) - np.log(np.arange(1, n // 2 + 1))",
+        "sum to 1",
+    ),
     (
         "04",
         "weights-check",
@@ -586,7 +720,12 @@ WRONG = [
         "new_mean = lambda population, cost: weights(10) @ population[np.argsort(cost)[::-1][:5]]",
         "mean of the worst",
     ),
-    ("04", "new-mean-check", "new_mean = lambda population, cost: weights(10) @ population[:5]", "was not sorted"),
+    (
+        "04",
+        "new-mean-check",
+        "new_mean = lambda population, cost: weights(10) @ population[:5]",
+        "was not sorted",
+    ),
     (
         "04",
         "new-mean-check",
@@ -611,7 +750,12 @@ WRONG = [
         "solved = ablate\nablate = lambda c, columns: solved(c, slice(32, None))",
         "columns is not used",
     ),
-    ("04", "expected-best-check", "expected_best = lambda returns, size, rng: returns.max()", "the largest of all"),
+    (
+        "04",
+        "expected-best-check",
+        "expected_best = lambda returns, size, rng: returns.max()",
+        "the largest of all",
+    ),
     (
         "04",
         "expected-best-check",
@@ -642,8 +786,12 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("number", "check", "answer", "message"), WRONG, ids=[f"{w[0]} {w[1]}: {w[3]}" for w in WRONG])
-def test_a_typical_wrong_answer_earns_the_message_that_names_it(moments, number, check, answer, message):
+@pytest.mark.parametrize(
+    ("number", "check", "answer", "message"), WRONG, ids=[f"{w[0]} {w[1]}: {w[3]}" for w in WRONG]
+)
+def test_a_typical_wrong_answer_earns_the_message_that_names_it(
+    moments, number, check, answer, message
+):
     names, source = moments[number, check]
     names = dict(names)
     exec(answer, names)
@@ -656,11 +804,18 @@ def test_right_answers_of_another_form_pass_and_serve_the_cells_after_them(momen
     names = dict(names)
     exec("solved = moments\nmoments = lambda *mixture: list(solved(*mixture))", names)
     exec(source, names)
-    names = dict(moments["02", "the end"][0])  # latents in an array that runs backwards, which PyTorch takes for none
-    exec("def active(kl, least=0.05): return np.argsort(kl.mean(0))[::-1][: (kl.mean(0) > least).sum()]", names)
+    names = dict(
+        moments["02", "the end"][0]
+    )  # latents in an array that runs backwards, which PyTorch takes for none
+    exec(
+        "def active(kl, least=0.05): return np.argsort(kl.mean(0))[::-1][: (kl.mean(0) > least).sum()]",
+        names,
+    )
     exec(moments["02", "active-check"][1], names)
     names |= {"frames": names["frames"][:60], "before": names["before"][:60]}
-    (silencing,) = [cell["source"] for cell in read_cells(SOURCES[NAMES[1]]) if "lively[:5]" in cell["source"]]
+    (silencing,) = [
+        cell["source"] for cell in read_cells(SOURCES[NAMES[1]]) if "lively[:5]" in cell["source"]
+    ]
     exec(silencing, names)
 
 

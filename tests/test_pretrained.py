@@ -17,7 +17,10 @@ from stad_lab.training.dataset import TRACK_RANGES, track_seeds
 from stad_lab.training.evolution import fitness_curves
 
 # An agent is named by its folder: `input`, or `second_round/input`.
-AGENTS = sorted(file.parent.relative_to(PRETRAINED).as_posix() for file in PRETRAINED.rglob("controller.safetensors"))
+AGENTS = sorted(
+    file.parent.relative_to(PRETRAINED).as_posix()
+    for file in PRETRAINED.rglob("controller.safetensors")
+)
 README = Path(__file__).parent.parent / "README.md"
 
 
@@ -51,7 +54,9 @@ def test_an_agent_of_every_variant_is_shipped_and_loads_by_its_name(variant):
 def test_a_shipped_evaluation_belongs_to_the_shipped_controller_and_to_unseen_tracks(agent):
     result = read(agent, "evaluation.json")
     returns = np.array([episode["return"] for episode in result["episodes"]])
-    assert result["controller_sha256"] == checksum((PRETRAINED / agent / "controller.safetensors").read_bytes())
+    assert result["controller_sha256"] == checksum(
+        (PRETRAINED / agent / "controller.safetensors").read_bytes()
+    )
     assert result["renderer"] == "official" and len(returns) == 100
     assert summarise(returns).items() <= result.items()
     low, high = TRACK_RANGES["test"]
@@ -63,8 +68,15 @@ def test_a_shipped_log_holds_every_generation_and_the_best_mean(agent):
     log, record = read(agent, "evolution.json"), read(agent, "record.json")
     settings = Settings.from_dict(record["settings"])
     assert fitness_curves(log["generations"]).shape == (3, settings.generations)
-    looks = {entry["generation"]: entry["validation"]["mean"] for entry in log["generations"] if "validation" in entry}
-    assert log["best"] == {"generation": max(looks, key=looks.get), "validation": max(looks.values())}
+    looks = {
+        entry["generation"]: entry["validation"]["mean"]
+        for entry in log["generations"]
+        if "validation" in entry
+    }
+    assert log["best"] == {
+        "generation": max(looks, key=looks.get),
+        "validation": max(looks.values()),
+    }
     assert record["budget"]["agents"] == settings.generations * settings.population
 
 
@@ -80,7 +92,11 @@ def test_the_readme_reports_the_shipped_evaluation(agent):
     table = README.read_text(encoding="utf-8").partition("| agent | all episodes |")[2]
     row = re.search(rf"^\| `{agent}` .*$", table, re.M).group()
     low, high = result["interval"]
-    for figure in (f"{result['mean']:.1f}", f"{result['standard_deviation']:.1f}", f"{low:.1f} to {high:.1f}"):
+    for figure in (
+        f"{result['mean']:.1f}",
+        f"{result['standard_deviation']:.1f}",
+        f"{low:.1f} to {high:.1f}",
+    ):
         assert figure in row
 
 
@@ -88,5 +104,7 @@ def test_the_shipped_agent_of_input_drives_as_well_with_either_renderer():
     official, fast = read("input", "evaluation.json"), read("input", "evaluation_fast.json")
     assert (official["renderer"], fast["renderer"]) == ("official", "fast")
     assert official["controller_sha256"] == fast["controller_sha256"]
-    assert [episode["track"] for episode in official["episodes"]] == [episode["track"] for episode in fast["episodes"]]
+    assert [episode["track"] for episode in official["episodes"]] == [
+        episode["track"] for episode in fast["episodes"]
+    ]
     assert abs(official["mean"] - fast["mean"]) < 15

@@ -32,7 +32,9 @@ def generate(target: Path) -> list[Path]:
     """
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        shutil.copytree(COURSE / "source", root / "source", ignore=shutil.ignore_patterns(".ipynb_checkpoints"))
+        shutil.copytree(
+            COURSE / "source", root / "source", ignore=shutil.ignore_patterns(".ipynb_checkpoints")
+        )
         shutil.copy(COURSE / "nbgrader_config.py", root)
         course, made = load_course(root), []
         for source in sorted((root / "source").iterdir()):

@@ -20,16 +20,26 @@ def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]
     """
     found = {}
     for submission in gradebook.notebook_submissions(name, name):
-        machine = sum(grade.auto_score or 0.0 for grade in submission.grades if grade.manual_score is None)
-        person = sum((grade.manual_score or 0.0) + (grade.extra_credit or 0.0) for grade in submission.grades)
-        found[submission.student.id] = machine, person, sum(grade.needs_manual_grade for grade in submission.grades)
+        machine = sum(
+            grade.auto_score or 0.0 for grade in submission.grades if grade.manual_score is None
+        )
+        person = sum(
+            (grade.manual_score or 0.0) + (grade.extra_credit or 0.0) for grade in submission.grades
+        )
+        found[submission.student.id] = (
+            machine,
+            person,
+            sum(grade.needs_manual_grade for grade in submission.grades),
+        )
     return found
 
 
 def read_marks(name: str) -> dict[str, tuple[float, float, int]]:
     """The marks in the gradebook of this folder. Ends the program if there is none, or no such assignment in it."""
     if not Path("gradebook.db").exists():
-        sys.exit(f"no gradebook.db in {Path.cwd()}: go to the folder of the course, where nbgrader has graded")
+        sys.exit(
+            f"no gradebook.db in {Path.cwd()}: go to the folder of the course, where nbgrader has graded"
+        )
     with Gradebook("sqlite:///gradebook.db") as gradebook:
         try:
             gradebook.find_assignment(name)
@@ -40,7 +50,9 @@ def read_marks(name: str) -> dict[str, tuple[float, float, int]]:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description="Print the marks of an assignment that nbgrader has graded, as CSV.")
+    parser = argparse.ArgumentParser(
+        description="Print the marks of an assignment that nbgrader has graded, as CSV."
+    )
     parser.add_argument("name", help="of the assignment, for example 01_difference_images")
     table = csv.writer(sys.stdout, lineterminator="\n")
     table.writerow(["student", "machine", "person", "mark", "unread"])

@@ -2,7 +2,13 @@
 
 from pathlib import Path
 
-from nbgrader.preprocessors import CheckCellMetadata, ClearOutput, DeduplicateIds, OverwriteCells, OverwriteKernelspec
+from nbgrader.preprocessors import (
+    CheckCellMetadata,
+    ClearOutput,
+    DeduplicateIds,
+    OverwriteCells,
+    OverwriteKernelspec,
+)
 
 
 class DropRepeated(DeduplicateIds):
@@ -19,11 +25,19 @@ class DropRepeated(DeduplicateIds):
         return cell, resources
 
 
-c = get_config()  # noqa: F821 (nbgrader runs this file with get_config in its globals)
+c = get_config()
 
 c.CourseDirectory.course_id = "stad_lab"
 c.CourseDirectory.root = str(Path(__file__).parent)
-c.ClearSolutions.code_stub = {"python": 'raise NotImplementedError("not done yet: replace this line with your code")'}
+c.ClearSolutions.code_stub = {
+    "python": 'raise NotImplementedError("not done yet: replace this line with your code")'
+}
 c.ClearSolutions.text_stub = "*Write your answer here.*"
 c.ExecutePreprocessor.timeout = 600  # seconds for a cell: weak machines, and students' loops
-c.Autograde.sanitize_preprocessors = [ClearOutput, DropRepeated, OverwriteKernelspec, OverwriteCells, CheckCellMetadata]
+c.Autograde.sanitize_preprocessors = [
+    ClearOutput,
+    DropRepeated,
+    OverwriteKernelspec,
+    OverwriteCells,
+    CheckCellMetadata,
+]

@@ -21,7 +21,9 @@ import math
 import os
 from collections.abc import Iterable
 
-os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # pygame greets on import, in every worker process
+os.environ.setdefault(
+    "PYGAME_HIDE_SUPPORT_PROMPT", "1"
+)  # pygame greets on import, in every worker process
 
 import cv2
 import gymnasium as gym
@@ -36,12 +38,20 @@ MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 TRACK_WIDTH = reference.TRACK_WIDTH  # half the width of the road, world units
 
 FAST_ID = "StadLab/CarRacing-v3"
-DARKENING = 2  # pygame's smoothscale loses two levels of every channel to its fixed-point sums; so do we
-TEXTURE_SCALE = 3.0  # texture pixels (texels) per world unit: nearly two to a pixel of the observation
+DARKENING = (
+    2  # pygame's smoothscale loses two levels of every channel to its fixed-point sums; so do we
+)
+TEXTURE_SCALE = (
+    3.0  # texture pixels (texels) per world unit: nearly two to a pixel of the observation
+)
 TEXTURE_SIZE = round(2 * reference.PLAYFIELD * TEXTURE_SCALE)  # texels, width and height
 LEVELS = (1, 2, 4, 8, 16)  # how many times smaller each copy of the texture is
-TEXELS = 1.3  # the copy to look at has at least so many texels to a pixel, and less than twice as many
-SHIFT = 4  # OpenCV's fixed-point polygons: coordinates carry this many binary digits behind the point
+TEXELS = (
+    1.3  # the copy to look at has at least so many texels to a pixel, and less than twice as many
+)
+SHIFT = (
+    4  # OpenCV's fixed-point polygons: coordinates carry this many binary digits behind the point
+)
 
 # The car stands still in the picture, for the camera is fixed to it: the pixel corner where the hull's origin lies,
 # and the size of a quarter of the car, in pixels.
@@ -57,7 +67,10 @@ QUARTERS = [
     for column in (0, QUARTER_COLUMNS)
 ]
 FINE = 8  # a quarter is drawn so many times larger, then averaged down
-TURN_STEPS, PHASE_STEPS = 24, 32  # a wheel's angle to the hull and its rotation are drawn in steps of 1/24 and 2 pi/32
+TURN_STEPS, PHASE_STEPS = (
+    24,
+    32,
+)  # a wheel's angle to the hull and its rotation are drawn in steps of 1/24 and 2 pi/32
 
 HULL_POLYGONS = [
     np.array(polygon) * car_dynamics.SIZE  # world units
@@ -69,13 +82,23 @@ HULL_POLYGONS = [
     )
 ]
 HULL_COLOR = (204, 0, 0)
-WHEEL_HALF_WIDTH, WHEEL_RADIUS = car_dynamics.WHEEL_W * car_dynamics.SIZE, car_dynamics.WHEEL_R * car_dynamics.SIZE
+WHEEL_HALF_WIDTH, WHEEL_RADIUS = (
+    car_dynamics.WHEEL_W * car_dynamics.SIZE,
+    car_dynamics.WHEEL_R * car_dynamics.SIZE,
+)
 
 # The gauges of the indicator bar: place in fortieths of the width, colour, and whether they grow upward or sideways.
 GAUGES = [(5, (255, 255, 255), True)]
-GAUGES += [(7, (0, 0, 255), True), (8, (0, 0, 255), True), (9, (51, 0, 255), True), (10, (51, 0, 255), True)]
+GAUGES += [
+    (7, (0, 0, 255), True),
+    (8, (0, 0, 255), True),
+    (9, (51, 0, 255), True),
+    (10, (51, 0, 255), True),
+]
 GAUGES += [(20, (0, 255, 0), False), (30, (255, 0, 0), False)]
-GAUGE_UNITS = [(reference.WINDOW_H if vertical else reference.WINDOW_W) / 40 for _, _, vertical in GAUGES]
+GAUGE_UNITS = [
+    (reference.WINDOW_H if vertical else reference.WINDOW_W) / 40 for _, _, vertical in GAUGES
+]
 
 
 def make_env(fast: bool = True, **kwargs) -> gym.Env:
@@ -111,7 +134,9 @@ class FastCarRacing(reference.CarRacing):
         self._bar = bar
         self.ground = Ground()
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
         """As Gymnasium's reset; the new track is painted on first sight."""
         self.ground.painted = False
         return super().reset(seed=seed, options=options)
@@ -169,13 +194,17 @@ class Ground:
             sizes = [TEXTURE_SIZE // shrink for shrink in LEVELS]
             self.levels = [np.empty((size, size, 3), np.uint8) for size in sizes]
         texture = self.levels[0]
-        np.copyto(texture, empty_field(tuple(darkened(env.bg_color)), tuple(darkened(env.grass_color))))
+        np.copyto(
+            texture, empty_field(tuple(darkened(env.bg_color)), tuple(darkened(env.grass_color)))
+        )
         points = on_texture(np.array([polygon for polygon, _ in env.road_poly]))
         for polygon, (_, color) in zip(points, env.road_poly, strict=True):
             cv2.fillConvexPoly(texture, polygon, darkened(color), cv2.LINE_8, SHIFT)
         for large, small in itertools.pairwise(self.levels):
             cv2.resize(large, small.shape[:2], small, interpolation=cv2.INTER_AREA)
-        tiles = [isinstance(color, np.ndarray) for _, color in env.road_poly]  # the others are kerbs
+        tiles = [
+            isinstance(color, np.ndarray) for _, color in env.road_poly
+        ]  # the others are kerbs
         self.tile_points = points[tiles]
         self.tiles_seen = 0
         self.painted = True
@@ -185,9 +214,17 @@ class Ground:
         if env.tile_visited_count != self.tiles_seen:
             self.tiles_seen = env.tile_visited_count
             for index in {tile.idx for wheel in env.car.wheels for tile in wheel.tiles}:
-                cv2.fillConvexPoly(self.levels[0], self.tile_points[index], darkened(env.road_color), cv2.LINE_8, SHIFT)
+                cv2.fillConvexPoly(
+                    self.levels[0],
+                    self.tile_points[index],
+                    darkened(env.road_color),
+                    cv2.LINE_8,
+                    SHIFT,
+                )
 
-    def look(self, view: np.ndarray, position: tuple[float, float], angle: float, zoom: float) -> None:
+    def look(
+        self, view: np.ndarray, position: tuple[float, float], angle: float, zoom: float
+    ) -> None:
         """Draw what the camera sees into `view`, uint8 (84, 96, 3): the observation above the indicator bar.
 
         Args:
@@ -195,7 +232,9 @@ class Ground:
             angle: of the hull, radians; the camera turns with it.
             zoom: window pixels (of 1000 x 800) per world unit.
         """
-        step_x = reference.WINDOW_W / OBSERVATION_SIZE / zoom  # world units from one pixel to the next
+        step_x = (
+            reference.WINDOW_W / OBSERVATION_SIZE / zoom
+        )  # world units from one pixel to the next
         step_y = reference.WINDOW_H / OBSERVATION_SIZE / zoom
         level = min(len(LEVELS) - 1, int(math.log2(max(1, step_x * TEXTURE_SCALE / TEXELS))))
         texels = TEXTURE_SCALE / LEVELS[level]
@@ -246,7 +285,9 @@ def draw_car(view: np.ndarray, car: car_dynamics.Car, zoom: float) -> None:
 
 def rectangle(half_width: float, low: float, high: float) -> np.ndarray:
     """Corners of a rectangle around the y axis, (4, 2)."""
-    return np.array([(-half_width, high), (half_width, high), (half_width, low), (-half_width, low)])
+    return np.array(
+        [(-half_width, high), (half_width, high), (half_width, low), (-half_width, low)]
+    )
 
 
 @functools.lru_cache(maxsize=10_000)  # pictures of 0.6 kB
@@ -265,19 +306,38 @@ def quarter_picture(place: int, turn: int, phase: int, zoom: float) -> np.ndarra
     angle = turn / TURN_STEPS
     rotation = np.array([(math.cos(angle), math.sin(angle)), (-math.sin(angle), math.cos(angle))])
     middle = np.array(car_dynamics.WHEELPOS[place]) * car_dynamics.SIZE
-    shapes = [(rectangle(WHEEL_HALF_WIDTH, -WHEEL_RADIUS, WHEEL_RADIUS) @ rotation + middle, car_dynamics.WHEEL_COLOR)]
+    shapes = [
+        (
+            rectangle(WHEEL_HALF_WIDTH, -WHEEL_RADIUS, WHEEL_RADIUS) @ rotation + middle,
+            car_dynamics.WHEEL_COLOR,
+        )
+    ]
     mark = wheel_mark((phase + 0.5) * math.tau / PHASE_STEPS)
     if mark:
-        shapes.append((rectangle(WHEEL_HALF_WIDTH, *mark) @ rotation + middle, car_dynamics.WHEEL_WHITE))
+        shapes.append(
+            (rectangle(WHEEL_HALF_WIDTH, *mark) @ rotation + middle, car_dynamics.WHEEL_WHITE)
+        )
     shapes += [(polygon, HULL_COLOR) for polygon in HULL_POLYGONS]
     rows, columns = FINE * QUARTER_ROWS, FINE * QUARTER_COLUMNS
     scale = zoom * FINE * OBSERVATION_SIZE / np.array([reference.WINDOW_W, -reference.WINDOW_H])
     corner = np.array([columns * (place % 2 == 0), rows * (place < 2)])
-    canvas = np.zeros((rows, columns, 4), np.uint8)  # red, green, blue, and how much of the ground is covered
+    canvas = np.zeros(
+        (rows, columns, 4), np.uint8
+    )  # red, green, blue, and how much of the ground is covered
     for polygon, color in shapes:
-        cv2.fillConvexPoly(canvas, to_fixed_point(polygon * scale + corner), [*darkened(color), 255], cv2.LINE_8, SHIFT)
-    small = cv2.resize(canvas, (QUARTER_COLUMNS, QUARTER_ROWS), interpolation=cv2.INTER_AREA).astype(np.float32)
-    return np.stack([np.repeat(1 - small[..., 3:] / 255, 3, axis=2), small[..., :3] + 0.5])  # + 0.5: rounds, not cuts
+        cv2.fillConvexPoly(
+            canvas,
+            to_fixed_point(polygon * scale + corner),
+            [*darkened(color), 255],
+            cv2.LINE_8,
+            SHIFT,
+        )
+    small = cv2.resize(
+        canvas, (QUARTER_COLUMNS, QUARTER_ROWS), interpolation=cv2.INTER_AREA
+    ).astype(np.float32)
+    return np.stack(
+        [np.repeat(1 - small[..., 3:] / 255, 3, axis=2), small[..., :3] + 0.5]
+    )  # + 0.5: rounds, not cuts
 
 
 def wheel_mark(phase: float) -> tuple[float, float] | None:
@@ -324,7 +384,9 @@ def score_picture(text: str) -> np.ndarray:
     """The bar with nothing but the score: uint8 (12, 96, 3)."""
     pygame.font.init()
     surface = bar_surface()
-    label = pygame.font.Font(pygame.font.get_default_font(), 42).render(text, True, (255, 255, 255), (0, 0, 0))
+    label = pygame.font.Font(pygame.font.get_default_font(), 42).render(
+        text, True, (255, 255, 255), (0, 0, 0)
+    )
     middle = reference.WINDOW_H * (5 - 2.5) / 40
     surface.blit(label, label.get_rect(center=(60, middle)))
     return shrink_bar(surface)
@@ -345,7 +407,9 @@ def gauge_picture(number: int, length: int) -> np.ndarray:
     return shrink_bar(surface)
 
 
-def place_car(env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, offset: float = 0.0) -> np.ndarray:
+def place_car(
+    env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, offset: float = 0.0
+) -> np.ndarray:
     """Put the car on a tile of the track, moving, with the opening zoom behind it.
 
     This is how a random driver comes to see more than the first bend: CarRacing itself always starts at rest on tile 0.
@@ -369,7 +433,9 @@ def place_car(env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, of
     car_racing.car = car_dynamics.Car(car_racing.world, heading, x, y)
     for wheel, (x, y) in zip(car_racing.car.wheels, car_dynamics.WHEELPOS, strict=True):
         # Gymnasium's Car places its wheels as if it always faced north; the first step would jerk them into place.
-        wheel.position = car_racing.car.hull.GetWorldPoint((x * car_dynamics.SIZE, y * car_dynamics.SIZE))
+        wheel.position = car_racing.car.hull.GetWorldPoint(
+            (x * car_dynamics.SIZE, y * car_dynamics.SIZE)
+        )
     for body in car_racing.car.drawlist:
         body.linearVelocity = (-math.sin(heading) * speed, math.cos(heading) * speed)
     for wheel in car_racing.car.wheels:

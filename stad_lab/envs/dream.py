@@ -12,7 +12,14 @@ import torch
 from stad_lab.agent import Agent
 from stad_lab.envs.car_racing import MAX_FRAMES
 from stad_lab.models.controller import control
-from stad_lab.models.mdn_rnn import ACTION_SIZE, MDNRNN, Mixture, State, check_temperature, sample_mixture
+from stad_lab.models.mdn_rnn import (
+    ACTION_SIZE,
+    MDNRNN,
+    Mixture,
+    State,
+    check_temperature,
+    sample_mixture,
+)
 from stad_lab.models.vae import AutoEncoder, to_uint8
 
 
@@ -36,7 +43,7 @@ class DreamEnv(gym.Env):
         ValueError: a temperature that is not above 0, or another render mode.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012 (Gymnasium's own convention)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}
 
     def __init__(
         self,
@@ -48,14 +55,22 @@ class DreamEnv(gym.Env):
     ):
         check_temperature(temperature)
         if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode={render_mode!r}: a dream can be rendered as 'rgb_array' only, or not (None)")
+            raise ValueError(
+                f"render_mode={render_mode!r}: a dream can be rendered as 'rgb_array' only, or not (None)"
+            )
         self.autoencoder, self.mdn_rnn = autoencoder, mdn_rnn
         self.temperature, self.max_frames, self.render_mode = temperature, max_frames, render_mode
-        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (autoencoder.latent_size,), np.float32)
-        self.action_space = gym.spaces.Box(np.array([-1, 0, 0], np.float32), np.ones(ACTION_SIZE, np.float32))
+        self.observation_space = gym.spaces.Box(
+            -np.inf, np.inf, (autoencoder.latent_size,), np.float32
+        )
+        self.action_space = gym.spaces.Box(
+            np.array([-1, 0, 0], np.float32), np.ones(ACTION_SIZE, np.float32)
+        )
         self.latents: torch.Tensor | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
         """Begin a dream.
 
         Args:
@@ -98,7 +113,9 @@ class DreamEnv(gym.Env):
             raise RuntimeError("step before reset: call reset() to begin a dream")
         action = np.asarray(action, np.float32)
         if action.shape != (ACTION_SIZE,) or not np.isfinite(action).all():
-            raise ValueError(f"action {action}: expected three finite numbers, steering, gas and brake")
+            raise ValueError(
+                f"action {action}: expected three finite numbers, steering, gas and brake"
+            )
         self.prediction, self.state = self.mdn_rnn(
             self.latents[None, None], torch.from_numpy(action)[None, None], self.state
         )
@@ -134,7 +151,9 @@ def check_numbers(name: str, found: torch.Tensor, shape: tuple[int, ...], meanin
 
 
 @torch.no_grad()
-def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def dream_on(
+    agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
     """Let an agent that has just acted in the real environment go on driving with its eyes closed.
 
     The dream begins with what M, after the agent's last action, expects to see next; from there on C sees the dream.
@@ -147,7 +166,9 @@ def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0)
         ValueError: the agent has not acted since its last reset, or drives several cars; or fewer than one frame.
     """
     if agent.state is None:
-        raise ValueError("the agent has not acted yet: let it drive a few real frames, then dream on")
+        raise ValueError(
+            "the agent has not acted yet: let it drive a few real frames, then dream on"
+        )
     if frames < 1:
         raise ValueError(f"frames={frames}: expected at least 1")
     if len(agent.cars) != 1:
@@ -155,7 +176,9 @@ def dream_on(agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0)
             f"the agent drives {len(agent.cars)} cars: expected one, so go on with agent.keep(np.array([0]))"
         )
     expected = agent.mdn_rnn.mixture(agent.state[0].transpose(0, 1))
-    latents = sample_mixture(expected, temperature, torch.Generator().manual_seed(seed))[0, 0].numpy()
+    latents = sample_mixture(expected, temperature, torch.Generator().manual_seed(seed))[
+        0, 0
+    ].numpy()
     env = DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature, frames, render_mode="rgb_array")
     latents, info = env.reset(seed=seed, options={"latents": latents, "state": agent.state})
     parameters, pictures, actions = agent.present_parameters(), [], []

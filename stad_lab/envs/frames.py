@@ -17,7 +17,10 @@ OBSERVATION_SHAPE = (OBSERVATION_SIZE, OBSERVATION_SIZE, 3)
 
 def check_observation(observation: np.ndarray) -> None:
     """Raise ValueError unless `observation` is a uint8 array (96, 96, 3), as CarRacing makes them."""
-    dtype, shape = getattr(observation, "dtype", type(observation).__name__), getattr(observation, "shape", "no shape")
+    dtype, shape = (
+        getattr(observation, "dtype", type(observation).__name__),
+        getattr(observation, "shape", "no shape"),
+    )
     if dtype != np.uint8 or shape != OBSERVATION_SHAPE:
         raise ValueError(
             f"observation with dtype {dtype} and shape {shape}: expected uint8 and {OBSERVATION_SHAPE}, as"

@@ -63,13 +63,25 @@ def evaluate(
             f" {low} to {high - 1}; those above are for training and validation"
         )
     agent, folder, read = load_agent(variant, path), run_folder(variant, path), None
-    while read != (now := checksum((folder / CONTROLLER).read_bytes())):  # a search may save a better one meanwhile
+    while read != (
+        now := checksum((folder / CONTROLLER).read_bytes())
+    ):  # a search may save a better one meanwhile
         agent, read = load_agent(variant, path), now
-    identity = {"variant": variant, "renderer": "fast" if fast else "official", "controller_sha256": read}
+    identity = {
+        "variant": variant,
+        "renderer": "fast" if fast else "official",
+        "controller_sha256": read,
+    }
     tracks = list(range(first_track, first_track + episodes))
     known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
-    weights = [checksum((folder / f"{part}.safetensors").read_bytes()) for part in ("autoencoder", "mdn_rnn")]
-    asked = identity | {"tracks": tracks, "weights": weights}  # V and M may be the same but for their precision
+    weights = [
+        checksum((folder / f"{part}.safetensors").read_bytes())
+        for part in ("autoencoder", "mdn_rnn")
+    ]
+    asked = identity | {
+        "tracks": tracks,
+        "weights": weights,
+    }  # V and M may be the same but for their precision
     driven = known["driven"] if known.get("identity") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]
@@ -87,7 +99,9 @@ def evaluate(
                 told = {"identity": asked, "driven": driven, "seconds": time.perf_counter() - begin}
                 with suppress(OSError):  # a full disk costs the right to go on, not the result
                     save_json(unfinished, told)
-    returns, lengths = (np.array(part) for part in zip(*(driven[str(track)] for track in tracks), strict=True))
+    returns, lengths = (
+        np.array(part) for part in zip(*(driven[str(track)] for track in tracks), strict=True)
+    )
     return {**identity, **report(tracks, returns, lengths), "seconds": time.perf_counter() - begin}
 
 
@@ -126,7 +140,9 @@ def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generato
     return rng, rng.integers(tracks, size=(resamples, 1, tracks))
 
 
-def resampled_means(returns: np.ndarray, rng: np.random.Generator, tracks: np.ndarray) -> np.ndarray:
+def resampled_means(
+    returns: np.ndarray, rng: np.random.Generator, tracks: np.ndarray
+) -> np.ndarray:
     """The mean return of each resample, float64 (resamples,), with seeds drawn here."""
     seeds = rng.integers(len(returns), size=(len(tracks), len(returns), 1))
     return returns[seeds, tracks].mean(axis=(1, 2))

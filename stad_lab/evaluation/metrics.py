@@ -16,7 +16,10 @@ from stad_lab.models.mdn_rnn import MDNRNN, Mixture, log_likelihood, sample_mixt
 from stad_lab.models.vae import AutoEncoder, kl_divergence, to_array, to_pictures
 
 ACTIVE = 0.05  # nats; a latent that tells less on average is called inactive
-CAR = (slice(50, 60), slice(29, 35))  # rows and columns of a frame that the car covers: the camera is fixed to it
+CAR = (
+    slice(50, 60),
+    slice(29, 35),
+)  # rows and columns of a frame that the car covers: the camera is fixed to it
 REGIONS = ("road", "grass", "car")
 
 
@@ -52,10 +55,18 @@ def redraw(autoencoder: AutoEncoder, frames: np.ndarray, earlier: np.ndarray) ->
     for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
         mu, logvar = autoencoder.encode(*to_pictures(*pair))
         frame, difference = autoencoder.decode(mu)
-        parts.append((to_array(frame), None if difference is None else to_array(difference), kl_divergence(mu, logvar)))
+        parts.append(
+            (
+                to_array(frame),
+                None if difference is None else to_array(difference),
+                kl_divergence(mu, logvar),
+            )
+        )
     drawn, differences, kl = zip(*parts, strict=True)
     return Redrawn(
-        np.concatenate(drawn), None if differences[0] is None else np.concatenate(differences), np.concatenate(kl)
+        np.concatenate(drawn),
+        None if differences[0] is None else np.concatenate(differences),
+        np.concatenate(kl),
     )
 
 
@@ -83,13 +94,21 @@ def autoencoder_quality(autoencoder: AutoEncoder, frames: np.ndarray, earlier: n
     drawn = redrawn.differences
     result = {
         "frame_error": error.sum(axis=(1, 2)).mean(),
-        "difference_error": None if drawn is None else ((drawn - difference) ** 2).sum(axis=(1, 2, 3)).mean(),
+        "difference_error": None
+        if drawn is None
+        else ((drawn - difference) ** 2).sum(axis=(1, 2, 3)).mean(),
         "blank_difference_error": (difference**2).sum(axis=(1, 2, 3)).mean(),
         "kl": redrawn.kl.sum(axis=1).mean(),
         "active": int((redrawn.kl.mean(axis=0) > ACTIVE).sum()),
     }
-    numbers = {name: value if value is None or name == "active" else float(value) for name, value in result.items()}
-    regions = {name: {what: float(value) for what, value in region.items()} for name, region in regions.items()}
+    numbers = {
+        name: value if value is None or name == "active" else float(value)
+        for name, value in result.items()
+    }
+    regions = {
+        name: {what: float(value) for what, value in region.items()}
+        for name, region in regions.items()
+    }
     return numbers | {"regions": regions, "kl_of_latents": redrawn.kl.mean(axis=0).tolist()}
 
 
@@ -116,7 +135,11 @@ def repeat_forecast(training: np.ndarray, latents: np.ndarray) -> np.ndarray:
 
 
 def linear_forecast(
-    training: np.ndarray, training_actions: np.ndarray, latents: np.ndarray, actions: np.ndarray, order: int
+    training: np.ndarray,
+    training_actions: np.ndarray,
+    latents: np.ndarray,
+    actions: np.ndarray,
+    order: int,
 ) -> np.ndarray:
     """NLL of a linear autoregression: the next z as a weighted sum of the last `order` z's and actions, plus noise.
 
@@ -134,7 +157,9 @@ def linear_forecast(
         return np.concatenate([*steps, np.ones_like(steps[0][..., :1])], axis=2)
 
     seen, wanted = past(training, training_actions), training[:, order:]
-    weights = np.linalg.lstsq(seen.reshape(-1, seen.shape[2]), wanted.reshape(-1, wanted.shape[2]), rcond=None)[0]
+    weights = np.linalg.lstsq(
+        seen.reshape(-1, seen.shape[2]), wanted.reshape(-1, wanted.shape[2]), rcond=None
+    )[0]
     sigma = (wanted - seen @ weights).std(axis=(0, 1))
     return gaussian_nll(latents[:, order:] - past(latents, actions) @ weights, sigma)
 
@@ -155,7 +180,9 @@ def single_step_nll(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -
     """As `mixture_nll` of M's forecast, but with an empty memory before every frame: each two are a drive."""
     pairs = np.stack([latents[:, :-1], latents[:, 1:]], axis=2).reshape(-1, 2, latents.shape[2])
     pair_actions = np.repeat(actions[:, :-1].reshape(-1, 1, actions.shape[2]), 2, axis=1)
-    return mixture_nll(forecast(mdn_rnn, pairs, pair_actions), pairs).reshape(len(latents), -1, latents.shape[2])
+    return mixture_nll(forecast(mdn_rnn, pairs, pair_actions), pairs).reshape(
+        len(latents), -1, latents.shape[2]
+    )
 
 
 def pit(mixture: Mixture, latents: np.ndarray) -> np.ndarray:
@@ -169,7 +196,9 @@ def pit(mixture: Mixture, latents: np.ndarray) -> np.ndarray:
     """
     target = torch.from_numpy(latents[:, 1:, :, None])
     below = torch.special.ndtr((target - mixture.mean) * torch.exp(-mixture.logsigma))
-    return (mixture.logpi.exp() * below).sum(dim=-1).clamp(max=1).numpy()  # weights add up to 1 but for rounding
+    return (
+        (mixture.logpi.exp() * below).sum(dim=-1).clamp(max=1).numpy()
+    )  # weights add up to 1 but for rounding
 
 
 @torch.no_grad()

@@ -15,7 +15,11 @@ TRIAL = 0.25  # share of the other drives on which the penalty is chosen
 
 
 def probe(
-    features: np.ndarray, targets: np.ndarray, drives: np.ndarray, seed: int = 0, resamples: int = 1000
+    features: np.ndarray,
+    targets: np.ndarray,
+    drives: np.ndarray,
+    seed: int = 0,
+    resamples: int = 1000,
 ) -> dict[str, np.ndarray]:
     """Fit a linear probe on some drives and measure it on the others.
 
@@ -48,14 +52,23 @@ def probe(
     return {"r2": r2_of_sums(sums), "low": low, "high": high}
 
 
-def choose_penalties(features: np.ndarray, targets: np.ndarray, fit: np.ndarray, trial: np.ndarray) -> np.ndarray:
+def choose_penalties(
+    features: np.ndarray, targets: np.ndarray, fit: np.ndarray, trial: np.ndarray
+) -> np.ndarray:
     """The penalty that does best for each target (targets,), fitted on the rows `fit` and tried on the rows `trial`."""
-    errors = [((targets[trial] - fit_ridge(features, targets, fit, p, trial)) ** 2).mean(axis=0) for p in PENALTIES]
+    errors = [
+        ((targets[trial] - fit_ridge(features, targets, fit, p, trial)) ** 2).mean(axis=0)
+        for p in PENALTIES
+    ]
     return PENALTIES[np.argmin(errors, axis=0)]
 
 
 def fit_ridge(
-    features: np.ndarray, targets: np.ndarray, fit: np.ndarray, penalty: float | np.ndarray, shown: np.ndarray
+    features: np.ndarray,
+    targets: np.ndarray,
+    fit: np.ndarray,
+    penalty: float | np.ndarray,
+    shown: np.ndarray,
 ) -> np.ndarray:
     """Fit a ridge regression on the rows `fit`, and predict the targets of the rows `shown`: (rows, targets)."""
     # Here, because it takes a second, and every command and every worker process imports this room.
@@ -69,7 +82,9 @@ def fit_ridge(
 
 def sums_of_drives(targets: np.ndarray, predicted: np.ndarray, drives: np.ndarray) -> np.ndarray:
     """Of every drive what R2 is made of: rows, sum, sum of squares and squared error; (drives, 4, targets)."""
-    parts = np.stack([np.ones_like(targets), targets, targets**2, (targets - predicted) ** 2], axis=1)
+    parts = np.stack(
+        [np.ones_like(targets), targets, targets**2, (targets - predicted) ** 2], axis=1
+    )
     return np.stack([parts[drives == drive].sum(axis=0) for drive in np.unique(drives)])
 
 
@@ -87,7 +102,9 @@ def check_rows(features: np.ndarray, targets: np.ndarray, drives: np.ndarray) ->
         )
     finite = np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
     if not finite.all():
-        raise ValueError(f"{(~finite).sum()} rows of features or targets that are not finite: leave those rows out")
+        raise ValueError(
+            f"{(~finite).sum()} rows of features or targets that are not finite: leave those rows out"
+        )
     constant = np.flatnonzero(np.ptp(targets, axis=0) == 0).tolist()
     if constant:
         raise ValueError(
@@ -95,4 +112,6 @@ def check_rows(features: np.ndarray, targets: np.ndarray, drives: np.ndarray) ->
         )
     count = len(np.unique(drives))
     if count < 10:
-        raise ValueError(f"{count} drives: expected at least 10, to fit on some and to measure on the others")
+        raise ValueError(
+            f"{count} drives: expected at least 10, to fit on some and to measure on the others"
+        )

@@ -54,13 +54,22 @@ class Drive:
 def true_motion(env: gym.Env) -> np.ndarray:
     """How the car moves and where it is on the road, from the simulator: float32 (6,), as MOTION names them."""
     car_racing = env.unwrapped
-    hull, track = car_racing.car.hull, np.array(car_racing.track)  # of a tile: progress, direction, x, y
-    along, across = (np.dot(hull.linearVelocity, hull.GetWorldVector(axis)) for axis in ((0, 1), (1, 0)))
-    _, direction, x, y = track[np.hypot(track[:, 2] - hull.position.x, track[:, 3] - hull.position.y).argmin()]
+    hull, track = (
+        car_racing.car.hull,
+        np.array(car_racing.track),
+    )  # of a tile: progress, direction, x, y
+    along, across = (
+        np.dot(hull.linearVelocity, hull.GetWorldVector(axis)) for axis in ((0, 1), (1, 0))
+    )
+    _, direction, x, y = track[
+        np.hypot(track[:, 2] - hull.position.x, track[:, 3] - hull.position.y).argmin()
+    ]
     offset = (hull.position.x - x) * np.cos(direction) + (hull.position.y - y) * np.sin(direction)
     turned = (hull.angle - direction + np.pi) % (2 * np.pi) - np.pi
     wheel_angle = car_racing.car.wheels[0].joint.angle
-    return np.array([along, across, hull.angularVelocity, wheel_angle, offset / TRACK_WIDTH, turned], np.float32)
+    return np.array(
+        [along, across, hull.angularVelocity, wheel_angle, offset / TRACK_WIDTH, turned], np.float32
+    )
 
 
 def driven_path(motion: np.ndarray) -> np.ndarray:
@@ -86,7 +95,9 @@ def road_in_sight(motion: np.ndarray) -> np.ndarray:
     return (np.abs(offset) < 3) & (np.abs(turned) < np.pi / 2)
 
 
-def record(env: gym.Env, observation: np.ndarray, act: Callable[[np.ndarray], np.ndarray], frames: int) -> Drive:
+def record(
+    env: gym.Env, observation: np.ndarray, act: Callable[[np.ndarray], np.ndarray], frames: int
+) -> Drive:
     """Drive on from `observation` for at most so many frames, and close the environment.
 
     Args:
@@ -107,7 +118,9 @@ def to_drive(rows: list[tuple]) -> Drive:
     if not rows:
         raise ValueError("a drive without a frame: drive at least one frame before you look at it")
     observations, actions, rewards, motion = zip(*rows, strict=True)
-    return Drive(np.array(observations), np.array(actions), np.array(rewards, np.float32), np.array(motion))
+    return Drive(
+        np.array(observations), np.array(actions), np.array(rewards, np.float32), np.array(motion)
+    )
 
 
 def record_random_drive(settings: Settings, index: int) -> Drive:
@@ -119,7 +132,9 @@ def record_random_drive(settings: Settings, index: int) -> Drive:
 def record_drive(agent: Agent, track: int, frames: int) -> Drive:
     """A drive of an agent from the start of a track, at most `frames` long."""
     env = make_env()
-    observation, _ = env.reset(seed=int(track))  # one that NumPy has chosen is NumPy's, which Gymnasium refuses
+    observation, _ = env.reset(
+        seed=int(track)
+    )  # one that NumPy has chosen is NumPy's, which Gymnasium refuses
     agent.reset()
     return record(env, observation, agent.act, frames)
 
@@ -144,7 +159,9 @@ class Inside:
     """What M expects after the frame and the action: parts (1, T, latent_size, mixtures)."""
 
 
-def encode_drive(autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: bool) -> tuple[np.ndarray, np.ndarray]:
+def encode_drive(
+    autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """What V makes of a drive: mu and logvar of z, float32 (T, latent_size) each; stride and bar as V was trained."""
     return tuple(encode_frames(autoencoder, drive.frames(crop_bar), stride))
 
@@ -157,7 +174,9 @@ def remember_drive(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) ->
 
 def remember_frames(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> torch.Tensor:
     """M's memory after every frame of a drive: float32 (1, T, hidden_size)."""
-    return mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)[0]
+    return mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)[
+        0
+    ]
 
 
 def memory_before(after: torch.Tensor) -> np.ndarray:
@@ -166,7 +185,9 @@ def memory_before(after: torch.Tensor) -> np.ndarray:
 
 
 @torch.no_grad()
-def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool) -> Inside:
+def look_inside(
+    autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool
+) -> Inside:
     """Show V and M a drive from its first frame on, and keep all they make of it; stride and bar as V was trained."""
     frames = drive.frames(crop_bar)
     mu, _ = encode_frames(autoencoder, frames, stride)
@@ -174,4 +195,6 @@ def look_inside(autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride:
     hidden, mixture = memory_before(after), mdn_rnn.mixture(after)
     drawn, changed = autoencoder.decode(torch.from_numpy(mu))
     changed = None if changed is None else to_array(changed)
-    return Inside(frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, hidden, mixture)
+    return Inside(
+        frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, hidden, mixture
+    )

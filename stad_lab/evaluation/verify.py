@@ -52,7 +52,9 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
     folder = Path(folder)
     record = load_json(folder / "record.json", GIVE_A_RUN)
     if "settings" not in record:
-        raise ValueError(f"{folder} is of {record['variant']}, which has no V, M and C: there is nothing to verify")
+        raise ValueError(
+            f"{folder} is of {record['variant']}, which has no V, M and C: there is nothing to verify"
+        )
     variant, settings = record["variant"], Settings.from_dict(record["settings"])
     checks: dict[str, Callable[[], str]] = {
         "record": lambda: f"ok: {variant}, {settings.name} settings",
@@ -127,10 +129,14 @@ def verify_mdn_rnn(folder: Path, variant: str, settings: Settings) -> str:
 def lacks(folder: Path, *names: str) -> bool:
     """Whether a file is not in the folder, or neither V nor M, with which it is checked: kept records have none."""
     weights = [folder / "autoencoder.safetensors", folder / "mdn_rnn.safetensors"]
-    return not any(file.exists() for file in weights) or not all((folder / name).exists() for name in names)
+    return not any(file.exists() for file in weights) or not all(
+        (folder / name).exists() for name in names
+    )
 
 
-def read_longest_log(variant: str, settings: Settings, folder: Path, world_model: WorldModel) -> dict:
+def read_longest_log(
+    variant: str, settings: Settings, folder: Path, world_model: WorldModel
+) -> dict:
     """The log as `read_log`; of a run that is being made longer it knows how long before the settings of the record."""
     asked = load_json(folder / LOG)["settings"]["generations"]
     return read_log(variant, dataclasses.replace(settings, generations=asked), folder, world_model)
@@ -158,7 +164,9 @@ def verify_controller(folder: Path, variant: str, settings: Settings) -> str:
     log = read_longest_log(variant, settings, folder, read_world_model(folder, variant))
     kept, best = kept_generation(variant, folder, log), log["best"]
     if best is None or kept != best["generation"]:
-        raise ValueError(f"{folder / CONTROLLER} is the C of generation {kept}, the log calls {best} the best")
+        raise ValueError(
+            f"{folder / CONTROLLER} is the C of generation {kept}, the log calls {best} the best"
+        )
     return f"ok: C of generation {kept}"
 
 
@@ -166,9 +174,17 @@ def verify_evaluations(folder: Path) -> str:
     """Check the files of `evaluate`, and that they are about this C."""
     files = sorted(folder.glob("evaluation*.json"))
     for file in files:
-        if load_json(file, "evaluate again")["controller_sha256"] != checksum((folder / CONTROLLER).read_bytes()):
-            raise ValueError(f"{file} tells of another controller than {folder / CONTROLLER}: evaluate again")
-    return f"ok: {', '.join(file.name for file in files)}" if files else "none: not evaluated in this folder"
+        if load_json(file, "evaluate again")["controller_sha256"] != checksum(
+            (folder / CONTROLLER).read_bytes()
+        ):
+            raise ValueError(
+                f"{file} tells of another controller than {folder / CONTROLLER}: evaluate again"
+            )
+    return (
+        f"ok: {', '.join(file.name for file in files)}"
+        if files
+        else "none: not evaluated in this folder"
+    )
 
 
 def drive_again(folder: Path, variant: str, settings: Settings, executor: Executor | None) -> str:
@@ -184,10 +200,17 @@ def drive_again(folder: Path, variant: str, settings: Settings, executor: Execut
         source = hand_out(executor, folder, variant)
         if evaluations:
             episodes, fast = evaluations[0]["episodes"], evaluations[0]["renderer"] == "fast"
-            chosen = [episodes[n] for n in np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)]
+            chosen = [
+                episodes[n]
+                for n in np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)
+            ]
             recorded = [episode["return"] for episode in chosen]
-            tasks = [(source, variant, parameters, [episode["track"]], fast, None) for episode in chosen]
-            driven = [float(returns[0]) for returns, _ in run_in_order(executor, drive_group, tasks)]
+            tasks = [
+                (source, variant, parameters, [episode["track"]], fast, None) for episode in chosen
+            ]
+            driven = [
+                float(returns[0]) for returns, _ in run_in_order(executor, drive_group, tasks)
+            ]
         else:  # all the tracks, because last bits depend on the cars that drive in step
             log = read_longest_log(variant, settings, folder, read_world_model(folder, variant))
             look = log["generations"][kept_generation(variant, folder, log) - 1]
@@ -195,4 +218,6 @@ def drive_again(folder: Path, variant: str, settings: Settings, executor: Execut
             driven = validate(executor, source, variant, settings, parameters)["returns"][:AGAIN]
     if driven != recorded:
         raise NotRepeated(f"the record says {recorded}, now it was {driven}")
-    return f"ok: {', '.join(f'{value:.1f}' for value in driven)} points, to the last bit as recorded"
+    return (
+        f"ok: {', '.join(f'{value:.1f}' for value in driven)} points, to the last bit as recorded"
+    )

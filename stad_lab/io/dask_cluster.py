@@ -33,11 +33,19 @@ class ClusterExecutor(ClientExecutor):
         Raises:
             TaskError: the scheduler is lost, or all workers are.
         """
-        once = {"allow_other_workers": True, "pure": False}  # another one may do it if that one is lost before it could
+        once = {
+            "allow_other_workers": True,
+            "pure": False,
+        }  # another one may do it if that one is lost before it could
         with warnings.catch_warnings(), task_errors("what workers share"):
-            warnings.filterwarnings("ignore", "Sending large graph")  # once for each run, not for each task
+            warnings.filterwarnings(
+                "ignore", "Sending large graph"
+            )  # once for each run, not for each task
             stand_in = self._client.submit(itself, value, pure=False)
-            fetched = [self._client.submit(fetch, stand_in, workers=[one], **once) for one in self._client.nthreads()]
+            fetched = [
+                self._client.submit(fetch, stand_in, workers=[one], **once)
+                for one in self._client.nthreads()
+            ]
             for future in fetched:
                 future.result()
         return stand_in
@@ -94,7 +102,9 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
             yield ClusterExecutor(client, pure=False)
         finally:
             if managed:
-                with suppress(Exception):  # whatever Dask raises if the scheduler, or by now the client, is lost
+                with suppress(
+                    Exception
+                ):  # whatever Dask raises if the scheduler, or by now the client, is lost
                     client.amm.start()
 
 
@@ -108,7 +118,9 @@ def check_address(address: str) -> None:
     try:
         certified = scheme == "tls" and Security().get_connection_args("client").get("ssl_context")
     except OSError as error:
-        raise ValueError(f"scheduler {address!r}: Dask's certificates cannot be read ({error})") from error
+        raise ValueError(
+            f"scheduler {address!r}: Dask's certificates cannot be read ({error})"
+        ) from error
     if scheme != "tcp" and not certified:
         raise ValueError(
             f"scheduler {address!r}: expected the address that it prints, such as tcp://10.0.0.1:8786 (one with tls://"

@@ -23,7 +23,9 @@ from safetensors.torch import load, save
 
 KIND = "stad_lab"
 CHECKSUM = "checksum"
-PATIENCE = 1.0 if os.name == "nt" else 0.0  # seconds: on Windows a virus scanner may hold a file for a moment
+PATIENCE = (
+    1.0 if os.name == "nt" else 0.0
+)  # seconds: on Windows a virus scanner may hold a file for a moment
 
 
 @contextmanager
@@ -44,10 +46,14 @@ def locked(folder: Path) -> Iterator[None]:
             f"{folder} is in use by another process: wait until that has ended, or choose another folder"
         ) from None
     except OSError as error:
-        raise OSError(f"{folder} is no folder to write to ({error.strerror}): choose another one") from error
+        raise OSError(
+            f"{folder} is no folder to write to ({error.strerror}): choose another one"
+        ) from error
     try:
         for file in folder.glob(".*.part"):
-            if (ours := re.fullmatch(r"\..+\.(\d+)\.part", file.name)) and not psutil.pid_exists(int(ours[1])):
+            if (ours := re.fullmatch(r"\..+\.(\d+)\.part", file.name)) and not psutil.pid_exists(
+                int(ours[1])
+            ):
                 file.unlink(missing_ok=True)
         yield
     finally:
@@ -114,7 +120,9 @@ def check_writable(path: Path) -> None:
     """Raise OSError, before any work, if the file `path` could not be written at its end."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give the name of a file")
-    if path.exists() and not path.is_file():  # a device, which a file would take the place of for everybody
+    if (
+        path.exists() and not path.is_file()
+    ):  # a device, which a file would take the place of for everybody
         raise OSError(f"{path} is no ordinary file: give the name of a file")
     trial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -160,7 +168,9 @@ def checksum(content: bytes) -> str:
 def save_json(path: Path, value: dict) -> None:
     """Write a dict as JSON, atomically, with a checksum of the rest as its last entry."""
     value = {name: part for name, part in value.items() if name != CHECKSUM}
-    write_bytes(path, (json.dumps(value | {CHECKSUM: checksum_of_json(value)}, indent=1) + "\n").encode())
+    write_bytes(
+        path, (json.dumps(value | {CHECKSUM: checksum_of_json(value)}, indent=1) + "\n").encode()
+    )
 
 
 def checksum_of_json(value: Any) -> str:
@@ -226,7 +236,9 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     except Exception as error:  # the parser meets bytes of any kind, and has many ways to say so
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
     if not isinstance(facts, dict):
-        raise ValueError(f"{path} was not written by stad_lab: give a file that `python -m stad_lab train` made")
+        raise ValueError(
+            f"{path} was not written by stad_lab: give a file that `python -m stad_lab train` made"
+        )
     wanted = facts.pop(CHECKSUM, None)
     if checksum_of_tensors(tensors, json.dumps(facts)) != wanted:
         raise damaged(path, "it does not hold what its checksum was made of", remedy)
@@ -241,7 +253,11 @@ def load_into(module: torch.nn.Module, tensors: dict[str, torch.Tensor], path: P
     """
     expected = module.state_dict()
     for name in sorted(expected.keys() | tensors.keys()):
-        if name not in tensors or name not in expected or tensors[name].shape != expected[name].shape:
+        if (
+            name not in tensors
+            or name not in expected
+            or tensors[name].shape != expected[name].shape
+        ):
             found = tuple(tensors[name].shape) if name in tensors else "nothing"
             wanted = tuple(expected[name].shape) if name in expected else "nothing"
             raise ValueError(
@@ -249,5 +265,7 @@ def load_into(module: torch.nn.Module, tensors: dict[str, torch.Tensor], path: P
                 " the weights belong to another variant or size"
             )
         if not torch.isfinite(tensors[name]).all():
-            raise ValueError(f"{path} holds values that are not finite in {name!r}: train this part again")
+            raise ValueError(
+                f"{path} holds values that are not finite in {name!r}: train this part again"
+            )
     module.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})

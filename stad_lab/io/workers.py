@@ -15,7 +15,14 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,7 +32,9 @@ import torch
 from tqdm.auto import tqdm
 
 M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # from glibc's malloc.h
-PRELOADED = ["stad_lab.training.pipeline"]  # what a worker imports: 2 to 4 seconds, of which PyTorch takes most
+PRELOADED = [
+    "stad_lab.training.pipeline"
+]  # what a worker imports: 2 to 4 seconds, of which PyTorch takes most
 TIME_LIMIT = 600.0  # seconds without any finished task, after which the workers count as stuck; a task takes some 10
 SLICES = 60  # in which patience is counted
 LOSSES = 3  # pools that may be lost in a row, before we stop to believe that it was an accident
@@ -60,7 +69,9 @@ class WorkerProcesses(Executor):
         self.losses, self.unfinished, self.silence = 0, 0, 0.0
         self.peak_memory = 0.0  # MB, of the largest process that was alive at the end
         self.pool = self._new_pool()
-        self.lost: list[ProcessPoolExecutor] = []  # kept, because one that goes wants the lock that it breaks under
+        self.lost: list[
+            ProcessPoolExecutor
+        ] = []  # kept, because one that goes wants the lock that it breaks under
         threading.Thread(target=self._watch, daemon=True).start()
 
     def submit(self, function: Callable, /, *arguments, **named) -> Future:
@@ -96,7 +107,9 @@ class WorkerProcesses(Executor):
         context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
         if sys.platform == "linux":
             context.set_forkserver_preload(PRELOADED)
-        count = min(self.count, 61) if sys.platform == "win32" else self.count  # as many as Windows can wait for
+        count = (
+            min(self.count, 61) if sys.platform == "win32" else self.count
+        )  # as many as Windows can wait for
         return ProcessPoolExecutor(count, mp_context=context, initializer=start_worker)
 
     def _begin(self, task: Future, work: Callable) -> None:
@@ -109,13 +122,25 @@ class WorkerProcesses(Executor):
             attempt.set_exception(error)
         attempt.add_done_callback(functools.partial(self._end, task, work, pool))
 
-    def _end(self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future) -> None:
-        error = BrokenProcessPool("the workers were stopped") if attempt.cancelled() else attempt.exception()
+    def _end(
+        self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future
+    ) -> None:
+        error = (
+            BrokenProcessPool("the workers were stopped")
+            if attempt.cancelled()
+            else attempt.exception()
+        )
         try:
-            if isinstance(error, BrokenProcessPool) and not self.closed.is_set() and self._replace(pool):
+            if (
+                isinstance(error, BrokenProcessPool)
+                and not self.closed.is_set()
+                and self._replace(pool)
+            ):
                 self._begin(task, work)
                 return
-        except Exception as failed:  # there are no more processes or files to be had: nobody else would be told
+        except (
+            Exception
+        ) as failed:  # there are no more processes or files to be had: nobody else would be told
             error = failed
         with self.lock:
             self.unfinished -= 1
@@ -133,13 +158,18 @@ class WorkerProcesses(Executor):
                 self.losses += 1
                 if self.losses > LOSSES:
                     return False
-                print("a worker process was lost: starting new ones, which do its work again", file=sys.stderr)
+                print(
+                    "a worker process was lost: starting new ones, which do its work again",
+                    file=sys.stderr,
+                )
                 self.lost.append(lost)
                 self.pool, self.silence = self._new_pool(), 0.0
             return True
 
     def _watch(self) -> None:
-        tick = min(1.0, self.time_limit / 4)  # counted, because a clock runs on while this process is suspended
+        tick = min(
+            1.0, self.time_limit / 4
+        )  # counted, because a clock runs on while this process is suspended
         while not self.closed.wait(tick):
             with self.lock:
                 self.silence = self.silence + tick if self.unfinished else 0.0
@@ -151,7 +181,9 @@ class WorkerProcesses(Executor):
 
 
 @contextmanager
-def worker_processes(count: int, given: Executor | None = None, time_limit: float = TIME_LIMIT) -> Iterator[Executor]:
+def worker_processes(
+    count: int, given: Executor | None = None, time_limit: float = TIME_LIMIT
+) -> Iterator[Executor]:
     """A pool of `count` processes for a `with` block; or the executor that is given, which stays open afterwards.
 
     The processes ignore Ctrl-C (the parent decides what an interrupt means) and end themselves when the parent is gone.
@@ -237,12 +269,22 @@ def finished_first(waiting: Iterable[Future], time_limit: float) -> set[Future]:
         done, _ = wait(waiting, time_limit / SLICES, return_when=FIRST_COMPLETED)
         if done:
             return done
-    raise TaskError(f"nothing was heard of the workers for {time_limit:.0f} seconds: see whether they live")
+    raise TaskError(
+        f"nothing was heard of the workers for {time_limit:.0f} seconds: see whether they live"
+    )
 
 
-def run_in_order(executor: Executor, function: Callable, tasks: list[tuple], label: str | None = None) -> list:
+def run_in_order(
+    executor: Executor, function: Callable, tasks: list[tuple], label: str | None = None
+) -> list:
     """What every task returned, in the order of the tasks; with a progress bar if it has a label. As `run_tasks`."""
-    finished = tqdm(run_tasks(executor, function, tasks), label, len(tasks), unit="episode", disable=label is None)
+    finished = tqdm(
+        run_tasks(executor, function, tasks),
+        label,
+        len(tasks),
+        unit="episode",
+        disable=label is None,
+    )
     return [result for _, result in sorted(finished, key=operator.itemgetter(0))]
 
 
@@ -273,7 +315,11 @@ def return_freed_memory(above: float = 2e9) -> None:
 
     Kept memory is chopped up in time: training M at paper scale would hold some 15 MB more after every step.
     """
-    if has_glibc() and int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") > above:
+    if (
+        has_glibc()
+        and int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        > above
+    ):
         ctypes.CDLL(None).malloc_trim(0)
 
 
@@ -299,7 +345,8 @@ def peak_memory(executor: Executor | None = None) -> dict[str, float] | None:
 
         unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes elsewhere
         process, worker = (
-            resource.getrusage(who).ru_maxrss * unit / 1e6 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+            resource.getrusage(who).ru_maxrss * unit / 1e6
+            for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
         )
     return {"process": round(process, 1)} | ({"worker": round(worker, 1)} if worker else {})
 
@@ -307,7 +354,11 @@ def peak_memory(executor: Executor | None = None) -> dict[str, float] | None:
 def most_memory(process: int) -> float:
     """The most memory in MB that a process of this number has held so far; 0 if it has ended, or not on Linux."""
     try:
-        return int(Path(f"/proc/{process}/status").read_text().split("VmHWM:")[1].split()[0]) * 1024 / 1e6
+        return (
+            int(Path(f"/proc/{process}/status").read_text().split("VmHWM:")[1].split()[0])
+            * 1024
+            / 1e6
+        )
     except (OSError, IndexError):
         return 0.0
 

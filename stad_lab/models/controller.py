@@ -36,7 +36,9 @@ def check_parameters(parameters: np.ndarray, count: int, source: str | Path = "c
             " belongs to a V or M of another size"
         )
     if not np.isfinite(parameters).all():
-        raise ValueError(f"{source}: parameters that are not finite (NaN or infinite): evolve the controller again")
+        raise ValueError(
+            f"{source}: parameters that are not finite (NaN or infinite): evolve the controller again"
+        )
 
 
 def unpack(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -63,7 +65,9 @@ def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
         raw = (weights * features[:, None]).sum(-1) + bias
     if not np.isfinite(raw).all():
         bad = raw[~np.isfinite(raw).all(axis=1)][0]
-        raise ValueError(f"action {bad} before squashing, expected finite numbers: check z, h and C for NaN")
+        raise ValueError(
+            f"action {bad} before squashing, expected finite numbers: check z, h and C for NaN"
+        )
     return squash(raw).astype(np.float32)
 
 

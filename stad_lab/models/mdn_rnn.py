@@ -16,13 +16,29 @@ from tqdm.auto import tqdm
 from stad_lab.config import Settings
 from stad_lab.envs.frames import earlier_frames
 from stad_lab.io.files import checksum_of_tensors, load_into, load_tensors, locked, save_tensors
-from stad_lab.models.vae import REMEDY, AutoEncoder, check_facts, check_part, load_autoencoder, to_pictures
+from stad_lab.models.vae import (
+    REMEDY,
+    AutoEncoder,
+    check_facts,
+    check_part,
+    load_autoencoder,
+    to_pictures,
+)
 from stad_lab.training.dataset import Rollouts, check_seen
 from stad_lab.training.trainer import fit, training_device
 
 ACTION_SIZE = 3
-M_SETTINGS = ("seed", "m_steps", "m_batch", "m_sequence", "m_learning_rate")  # what a trained M depends on, beside V
-LOGSIGMA_RANGE = (-5.0, 3.0)  # a narrower Gaussian would let the likelihood run away on a single latent
+M_SETTINGS = (
+    "seed",
+    "m_steps",
+    "m_batch",
+    "m_sequence",
+    "m_learning_rate",
+)  # what a trained M depends on, beside V
+LOGSIGMA_RANGE = (
+    -5.0,
+    3.0,
+)  # a narrower Gaussian would let the likelihood run away on a single latent
 
 State = tuple[torch.Tensor, torch.Tensor]  # h and c of the LSTM, each (1, batch, hidden_size)
 
@@ -69,14 +85,18 @@ class MDNRNN(nn.Module):
         hidden, state = self.remember(latents, actions, state)
         return self.mixture(hidden), state
 
-    def remember(self, latents: torch.Tensor, actions: torch.Tensor, state: State | None) -> tuple[torch.Tensor, State]:
+    def remember(
+        self, latents: torch.Tensor, actions: torch.Tensor, state: State | None
+    ) -> tuple[torch.Tensor, State]:
         """The memory without the prediction: h after every step (batch, time, hidden_size), and the state."""
         return self.lstm(torch.cat([latents, actions], dim=2), state)
 
     def mixture(self, hidden: torch.Tensor) -> Mixture:
         """The head: h (batch, time, hidden_size) -> the mixture it stands for."""
         batch, time, _ = hidden.shape
-        logits, mean, logsigma = self.head(hidden).view(batch, time, 3, self.latent_size, self.mixtures).unbind(2)
+        logits, mean, logsigma = (
+            self.head(hidden).view(batch, time, 3, self.latent_size, self.mixtures).unbind(2)
+        )
         return Mixture(logits.log_softmax(-1), mean, logsigma.clamp(*LOGSIGMA_RANGE))
 
 
@@ -99,7 +119,9 @@ def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
     return -log_likelihood(mixture, target).mean()
 
 
-def sample_mixture(mixture: Mixture, temperature: float, generator: torch.Generator | None = None) -> torch.Tensor:
+def sample_mixture(
+    mixture: Mixture, temperature: float, generator: torch.Generator | None = None
+) -> torch.Tensor:
     """Draw z (batch, time, latent_size) from the mixture.
 
     Args:
@@ -114,7 +136,10 @@ def sample_mixture(mixture: Mixture, temperature: float, generator: torch.Genera
     weights = (mixture.logpi / temperature).softmax(-1)
     flat = weights.reshape(-1, weights.shape[-1])
     choice = torch.multinomial(flat, 1, generator=generator).view(*weights.shape[:-1], 1)
-    mean, logsigma = mixture.mean.gather(-1, choice)[..., 0], mixture.logsigma.gather(-1, choice)[..., 0]
+    mean, logsigma = (
+        mixture.mean.gather(-1, choice)[..., 0],
+        mixture.logsigma.gather(-1, choice)[..., 0],
+    )
     noise = torch.randn(mean.shape, generator=generator)
     return mean + logsigma.exp() * math.sqrt(temperature) * noise
 
@@ -131,7 +156,11 @@ def check_temperature(temperature: float) -> None:
 def encode_frames(autoencoder: AutoEncoder, frames: np.ndarray, stride: int) -> np.ndarray:
     """What V makes of an episode's frames, uint8 (T, 64, 64, 3): mu and logvar, float32 (2, T, latent_size)."""
     device, count = next(autoencoder.parameters()).device, max(1, len(frames) // 250)
-    pairs = zip(np.array_split(frames, count), np.array_split(earlier_frames(frames, stride), count), strict=True)
+    pairs = zip(
+        np.array_split(frames, count),
+        np.array_split(earlier_frames(frames, stride), count),
+        strict=True,
+    )
     parts = [torch.stack(autoencoder.encode(*to_pictures(*pair, device))) for pair in pairs]
     return torch.cat(parts, dim=1).cpu().numpy()
 
@@ -141,13 +170,19 @@ def encode_rollouts(autoencoder: AutoEncoder, rollouts: Rollouts, stride: int) -
     # One array, made before the work: a small one kept after each episode would chop up the memory that is freed.
     whole = np.empty((2, len(rollouts), autoencoder.latent_size), np.float32)
     encoded = np.split(whole, np.flatnonzero(np.diff(rollouts.episode)) + 1, axis=1)  # views on it
-    for episode, frames in zip(encoded, tqdm(rollouts.frames, "encode", unit="episode"), strict=True):
+    for episode, frames in zip(
+        encoded, tqdm(rollouts.frames, "encode", unit="episode"), strict=True
+    ):
         episode[:] = encode_frames(autoencoder, frames, stride)
     return encoded
 
 
 def sequence_batch(
-    encoded: list[np.ndarray], actions: list[np.ndarray], length: int, batch: int, rng: np.random.Generator
+    encoded: list[np.ndarray],
+    actions: list[np.ndarray],
+    length: int,
+    batch: int,
+    rng: np.random.Generator,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Random stretches of random episodes: z (batch, length + 1, latent_size) and actions (batch, length, 3).
 
@@ -212,7 +247,9 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     rollouts = Rollouts(rollouts_folder)
     check_seen(v_path, v_facts["rollouts"], rollouts_folder)
     if v_facts["rollouts"] is None:
-        raise ValueError(f"{v_path} does not tell on which rollouts it was trained: train it again in another folder")
+        raise ValueError(
+            f"{v_path} does not tell on which rollouts it was trained: train it again in another folder"
+        )
     torch.manual_seed(settings.seed)
     device = training_device()
     mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).to(device)
@@ -220,13 +257,18 @@ def train_mdn_rnn(variant: str, settings: Settings, rollouts_folder: Path, folde
     if settings.m_steps:
         check_lengths(rollouts, settings)  # before V encodes them all
         encoded = encode_rollouts(autoencoder.to(device), rollouts, settings.stride)
-    fit_mdn_rnn(path, mdn_rnn, variant, v_facts["identity"], encoded, rollouts.actions, rollouts, settings)
+    fit_mdn_rnn(
+        path, mdn_rnn, variant, v_facts["identity"], encoded, rollouts.actions, rollouts, settings
+    )
     return True
 
 
 def check_lengths(rollouts: Rollouts, settings: Settings) -> None:
     """Raise ValueError unless there is a training episode, and a held-out one, that holds a whole sequence."""
-    lengths, first_heldout = np.bincount(rollouts.episode).tolist(), rollouts.episode[rollouts.split()[1][0]]
+    lengths, first_heldout = (
+        np.bincount(rollouts.episode).tolist(),
+        rollouts.episode[rollouts.split()[1][0]],
+    )
     long_episodes(lengths[:first_heldout], settings.m_sequence, "training ")
     long_episodes(lengths[first_heldout:], settings.m_sequence, "held-out ")
 
@@ -246,13 +288,20 @@ def fit_mdn_rnn(
     Training has a fixed length; the rollouts say which episodes are held out, `v_identity` is that of the V that
     has encoded them. It resumes.
     """
-    device, first_heldout = next(mdn_rnn.parameters()).device, rollouts.episode[rollouts.split()[1][0]]
+    device, first_heldout = (
+        next(mdn_rnn.parameters()).device,
+        rollouts.episode[rollouts.split()[1][0]],
+    )
 
-    def draw(episodes: slice, batch: int, rng: np.random.Generator) -> tuple[torch.Tensor, torch.Tensor]:
+    def draw(
+        episodes: slice, batch: int, rng: np.random.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         return sequence_batch(encoded[episodes], actions[episodes], settings.m_sequence, batch, rng)
 
     def batch(step: int) -> tuple[torch.Tensor, torch.Tensor]:
-        return draw(slice(first_heldout), settings.m_batch, np.random.default_rng([settings.seed, 2, step]))
+        return draw(
+            slice(first_heldout), settings.m_batch, np.random.default_rng([settings.seed, 2, step])
+        )
 
     def losses(latents: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         latents = latents.to(device)
@@ -261,16 +310,27 @@ def fit_mdn_rnn(
 
     @torch.no_grad()
     def heldout_losses() -> dict[str, float]:
-        return {"total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))["total"].item()}
+        return {
+            "total": losses(*draw(slice(first_heldout, None), 64, np.random.default_rng(0)))[
+                "total"
+            ].item()
+        }
 
     if settings.m_steps:
         check_lengths(rollouts, settings)
     checkpoint = checkpoint_of(path)
-    identity = {"part": "mdn_rnn", "variant": variant, "autoencoder": v_identity, "rollouts": rollouts.identity}
+    identity = {
+        "part": "mdn_rnn",
+        "variant": variant,
+        "autoencoder": v_identity,
+        "rollouts": rollouts.identity,
+    }
     identity |= settings.as_dict()
     steps, rate = settings.m_steps, settings.m_learning_rate
     with locked(path.parent):
-        history = fit(mdn_rnn, batch, losses, heldout_losses, steps, rate, checkpoint, "train M", identity)
+        history = fit(
+            mdn_rnn, batch, losses, heldout_losses, steps, rate, checkpoint, "train M", identity
+        )
         save_mdn_rnn(path, mdn_rnn, variant, settings, history, v_identity)
         checkpoint.unlink(missing_ok=True)  # there is none after 0 steps
 
@@ -281,20 +341,29 @@ def checkpoint_of(path: Path) -> Path:
 
 
 def save_mdn_rnn(
-    path: Path, mdn_rnn: MDNRNN, variant: str, settings: Settings, history: list, v_identity: str | None = None
+    path: Path,
+    mdn_rnn: MDNRNN,
+    variant: str,
+    settings: Settings,
+    history: list,
+    v_identity: str | None = None,
 ) -> None:
     """Write M's weights with what is needed to build it again, and the variant and identity of the V it belongs to."""
     facts = {"part": "mdn_rnn", "variant": variant, "autoencoder": v_identity, "history": history}
     facts |= {name: getattr(mdn_rnn, name) for name in ("latent_size", "hidden_size", "mixtures")}
     facts |= {name: getattr(settings, name) for name in M_SETTINGS}
-    save_tensors(path, mdn_rnn.state_dict(), identity=checksum_of_tensors(mdn_rnn.state_dict()), **facts)
+    save_tensors(
+        path, mdn_rnn.state_dict(), identity=checksum_of_tensors(mdn_rnn.state_dict()), **facts
+    )
 
 
 def check_partner(path: Path, facts: dict, **identities: str) -> None:
     """Raise ValueError unless a file's facts name the V, and the M, of these identities as those it was made with."""
     for part, identity in identities.items():
         if facts.get(part) != identity:
-            raise ValueError(f"{path} was made with another {part} than the one beside it: give V, M and C of one run")
+            raise ValueError(
+                f"{path} was made with another {part} than the one beside it: give V, M and C of one run"
+            )
 
 
 def load_mdn_rnn(path: Path, variant: str | None = None) -> tuple[MDNRNN, dict]:

@@ -74,11 +74,15 @@ class ToColours(nn.ConvTranspose2d):
 
 class _Enlarge(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, pictures: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor) -> torch.Tensor:
+    def forward(
+        ctx, pictures: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor
+    ) -> torch.Tensor:
         """The shuffled convolution."""
         ctx.save_for_backward(pictures, weight)
         channels_in, channels_out = weight.shape[:2]
-        taps = weight.reshape(channels_in, channels_out, 3, 2, 3, 2).flip(2, 4)  # row, its parity, column, its parity
+        taps = weight.reshape(channels_in, channels_out, 3, 2, 3, 2).flip(
+            2, 4
+        )  # row, its parity, column, its parity
         taps = taps.permute(1, 3, 5, 0, 2, 4).reshape(4 * channels_out, channels_in, 3, 3)
         drawn = nn.functional.conv2d(pictures, taps, bias.repeat_interleave(4), padding=2)
         return nn.functional.pixel_shuffle(drawn, 2)
@@ -140,7 +144,9 @@ class AutoEncoder(nn.Module):
             ToColours(width, 6 if self.redraws_difference else 3),  # 30 -> 64
         )
 
-    def encode(self, frame: torch.Tensor, difference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def encode(
+        self, frame: torch.Tensor, difference: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """q(z | x) = N(mu, exp(logvar)): two tensors (batch, latent_size)."""
         seen = torch.cat([frame, difference], 1) if self.sees_difference else frame
         mu, logvar = self.encoder(seen).chunk(2, dim=1)
@@ -149,9 +155,13 @@ class AutoEncoder(nn.Module):
     def decode(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
         """z (batch, latent_size) -> the frame in [0, 1], and the difference image in [-1, 1] or None."""
         drawn = self.decoder(z)
-        return torch.sigmoid(drawn[:, :3]), torch.tanh(drawn[:, 3:]) if self.redraws_difference else None
+        return torch.sigmoid(drawn[:, :3]), torch.tanh(
+            drawn[:, 3:]
+        ) if self.redraws_difference else None
 
-    def reconstruct(self, frame: torch.Tensor, difference: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
+    def reconstruct(
+        self, frame: torch.Tensor, difference: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Encode and decode through the mean mu, without sampling."""
         return self.decode(self.encode(frame, difference)[0])
 
@@ -184,7 +194,11 @@ def to_uint8(frames: torch.Tensor) -> np.ndarray:
 
 
 def autoencoder_losses(
-    autoencoder: AutoEncoder, frame: torch.Tensor, difference: torch.Tensor, noise: torch.Tensor, settings: Settings
+    autoencoder: AutoEncoder,
+    frame: torch.Tensor,
+    difference: torch.Tensor,
+    noise: torch.Tensor,
+    settings: Settings,
 ) -> dict[str, torch.Tensor]:
     """The loss of V, each term named; means over the batch.
 
@@ -195,7 +209,9 @@ def autoencoder_losses(
     World Models. `noise` is N(0, 1) of shape (batch, latent_size).
     """
     mu, logvar = autoencoder.encode(frame, difference)
-    z = mu + torch.exp(0.5 * logvar) * noise  # the reparameterisation trick: gradients flow through mu and logvar
+    z = (
+        mu + torch.exp(0.5 * logvar) * noise
+    )  # the reparameterisation trick: gradients flow through mu and logvar
     drawn_frame, drawn_difference = autoencoder.decode(z)
     losses = {"frame_error": squared_error(drawn_frame, frame)}
     total = losses["frame_error"]
@@ -247,20 +263,29 @@ def train_autoencoder(
         return False
     rollouts = Rollouts(rollouts_folder)
     torch.manual_seed(settings.seed)
-    autoencoder, device = AutoEncoder(variant, settings.latent_size, settings.width), training_device()
+    autoencoder, device = (
+        AutoEncoder(variant, settings.latent_size, settings.width),
+        training_device(),
+    )
     autoencoder.to(device, memory_format=torch.channels_last)
     training, heldout = rollouts.split()
     heldout = heldout[np.linspace(0, len(heldout) - 1, min(1000, len(heldout))).astype(int)]
 
-    def draw(indices: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
-        noise = torch.from_numpy(rng.standard_normal((len(indices), settings.latent_size), np.float32))
+    def draw(
+        indices: np.ndarray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
+        noise = torch.from_numpy(
+            rng.standard_normal((len(indices), settings.latent_size), np.float32)
+        )
         return *rollouts.pairs(indices, settings.stride), noise
 
     def batch(step: int) -> tuple[np.ndarray, np.ndarray, torch.Tensor]:
         rng = np.random.default_rng([settings.seed, 1, step])
         return draw(np.sort(rng.choice(training, settings.v_batch)), rng)
 
-    def losses(frames: np.ndarray, earlier: np.ndarray, noise: torch.Tensor) -> dict[str, torch.Tensor]:
+    def losses(
+        frames: np.ndarray, earlier: np.ndarray, noise: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
         frame, difference = to_pictures(frames, earlier, device)
         return autoencoder_losses(autoencoder, frame, difference, noise.to(device), settings)
 
@@ -269,13 +294,32 @@ def train_autoencoder(
         parts = np.array_split(heldout, min(8, len(heldout)))
         found = [losses(*draw(part, np.random.default_rng(0))) for part in parts]
         weights = [len(part) for part in parts]
-        return {name: float(np.average([loss[name].item() for loss in found], weights=weights)) for name in found[0]}
+        return {
+            name: float(np.average([loss[name].item() for loss in found], weights=weights))
+            for name in found[0]
+        }
 
     label = f"train V ({variant})"
-    identity = {"part": "autoencoder", "variant": variant, "rollouts": rollouts.identity, **settings.as_dict()}
+    identity = {
+        "part": "autoencoder",
+        "variant": variant,
+        "rollouts": rollouts.identity,
+        **settings.as_dict(),
+    }
     steps, rate = settings.v_steps, settings.v_learning_rate
     with locked(path.parent):
-        history = fit(autoencoder, batch, losses, heldout_losses, steps, rate, checkpoint, label, identity, watch)
+        history = fit(
+            autoencoder,
+            batch,
+            losses,
+            heldout_losses,
+            steps,
+            rate,
+            checkpoint,
+            label,
+            identity,
+            watch,
+        )
         save_autoencoder(path, autoencoder, settings, history, rollouts.identity)
         checkpoint.unlink(missing_ok=True)
     return True
@@ -283,11 +327,17 @@ def train_autoencoder(
 
 def check_facts(path: Path, facts: dict, settings: Settings) -> None:
     """Raise ValueError if weights were made with other settings, as far as their facts tell, than asked for now."""
-    check_same_run(path, facts, {name: wanted for name, wanted in settings.as_dict().items() if name in facts})
+    check_same_run(
+        path, facts, {name: wanted for name, wanted in settings.as_dict().items() if name in facts}
+    )
 
 
 def save_autoencoder(
-    path: Path, autoencoder: AutoEncoder, settings: Settings, history: list, rollouts: str | None = None
+    path: Path,
+    autoencoder: AutoEncoder,
+    settings: Settings,
+    history: list,
+    rollouts: str | None = None,
 ) -> None:
     """Write V's weights with what is needed to build it again and to feed it as it was trained.
 
@@ -304,7 +354,9 @@ def save_autoencoder(
 def check_part(path: Path, facts: dict, part: str, variant: str | None) -> None:
     """Raise ValueError unless a file's facts say that it holds `part`, and of this variant unless that is None."""
     if facts.get("part") != part:
-        raise ValueError(f"{path} holds {facts.get('part')!r}: expected {part!r}; give the file of that name")
+        raise ValueError(
+            f"{path} holds {facts.get('part')!r}: expected {part!r}; give the file of that name"
+        )
     if variant not in (None, facts.get("variant")):
         raise ValueError(
             f"{path} holds variant {facts.get('variant')!r}, and {variant!r} was asked for: give its own run"

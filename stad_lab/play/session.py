@@ -124,7 +124,13 @@ class Session:
             raise ValueError(f"track={track!r}: expected a whole number from {low} to {high - 1:,}")
         if self.rows:
             self.earlier.append((self.track, self.drive()))
-        self.track, self.score, self.rows, self.dream_rows, self.drivers = int(track), 0.0, [], [], []
+        self.track, self.score, self.rows, self.dream_rows, self.drivers = (
+            int(track),
+            0.0,
+            [],
+            [],
+            [],
+        )
         self.world, self.real_ended, self.dream_ended = "real", False, False
         self.hand.action = np.zeros(3, np.float32)
         self.observation, _ = self.env.reset(seed=self.track)
@@ -165,7 +171,9 @@ class Session:
             RuntimeError: the episode has ended.
         """
         if self.ended:
-            raise RuntimeError("the episode has ended: begin(track) another, or enter(world) the other world")
+            raise RuntimeError(
+                "the episode has ended: begin(track) another, or enter(world) the other world"
+            )
         if self.world == "real":
             self._step_real()
         else:
@@ -187,8 +195,12 @@ class Session:
     def dreamt(self) -> Dreamt:
         """The present dream, or the last one on this track. Raises ValueError if nothing was driven in one."""
         if not self.dream_rows:
-            raise ValueError("nothing was driven in a dream on this track: enter('dream') and drive there first")
-        frames, latents, actions, by_hand = (np.array(part) for part in zip(*self.dream_rows, strict=True))
+            raise ValueError(
+                "nothing was driven in a dream on this track: enter('dream') and drive there first"
+            )
+        frames, latents, actions, by_hand = (
+            np.array(part) for part in zip(*self.dream_rows, strict=True)
+        )
         return Dreamt(frames, latents, actions, by_hand)
 
     def _step_real(self) -> None:
@@ -197,7 +209,9 @@ class Session:
         if driver == "hand":  # M remembered what the agent would have done: tell it what was done
             self.agent.take_in(action[None], self.before)
         following, reward, terminated, truncated, _ = self.env.step(action)
-        self.drivers.append(driver)  # first: who reads `drive` and then `by_hand` meanwhile has all of the latter
+        self.drivers.append(
+            driver
+        )  # first: who reads `drive` and then `by_hand` meanwhile has all of the latter
         self.rows.append((self.observation, action, reward, motion))
         self.observation, self.score = following, self.score + reward
         self.real_ended = terminated or truncated

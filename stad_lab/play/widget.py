@@ -17,9 +17,19 @@ from stad_lab.viz.widgets import picture_png
 
 PICTURE_SIZE = 448  # pixels on the page
 FRAME_IDLE, FRAME_LISTENING = "4px solid transparent", f"4px solid {ORANGE}"
-LONGEST_WAIT = 0.2  # seconds that the car waits for a browser which has not shown the last pictures yet
-PRESSED, RELEASED = ("mousedown", "touchstart"), ("mouseup", "mouseleave", "touchend", "touchcancel")
-PEDAL_ICONS = {"gas": "arrow-up", "left": "arrow-left", "brake": "arrow-down", "right": "arrow-right"}
+LONGEST_WAIT = (
+    0.2  # seconds that the car waits for a browser which has not shown the last pictures yet
+)
+PRESSED, RELEASED = (
+    ("mousedown", "touchstart"),
+    ("mouseup", "mouseleave", "touchend", "touchcancel"),
+)
+PEDAL_ICONS = {
+    "gas": "arrow-up",
+    "left": "arrow-left",
+    "brake": "arrow-down",
+    "right": "arrow-right",
+}
 HELP = """<style>.stad-lab-pixels {image-rendering: pixelated}</style><div style="line-height: 1.4">
 Rest the pointer on the picture: an orange frame says that the keys drive. <b>Arrows</b> or <b>WASD</b> steer, give gas
 and brake; <b>T</b> takes the wheel from the agent or gives it back; <b>P</b> drives and pauses.</div>"""
@@ -39,8 +49,13 @@ class Loop(threading.Thread):
             while not self.stopped.is_set() and self.seat.advance():
                 now = time.perf_counter()
                 self.seat.pace = 1 / (0.9 / self.seat.pace + 0.1 * max(now - before, 1e-3))
-                due, before = max(due + 1 / self.seat.speed.value, now - 0.1), now  # a short delay is made good
-                self.stopped.wait(max(due - now, 0.002))  # never without a pause: the kernel must hear the keys
+                due, before = (
+                    max(due + 1 / self.seat.speed.value, now - 0.1),
+                    now,
+                )  # a short delay is made good
+                self.stopped.wait(
+                    max(due - now, 0.002)
+                )  # never without a pause: the kernel must hear the keys
                 patience = time.perf_counter() + LONGEST_WAIT
                 while self.seat.browser_is_behind() and time.perf_counter() < patience:
                     self.stopped.wait(0.005)
@@ -77,24 +92,35 @@ class Seat:
     def __init__(self, session: Session):
         stop_loops()
         self.session, self.loop, self.pace, self.error = session, None, 0.0, ""
-        self.lock, self.told = threading.RLock(), 0.0  # of the session; when the status was last written
+        self.lock, self.told = (
+            threading.RLock(),
+            0.0,
+        )  # of the session; when the status was last written
         self.picture = ipywidgets.Image(format="png", width=PICTURE_SIZE, height=PICTURE_SIZE)
         self.picture.layout = {"border": FRAME_IDLE, "max_width": "none"}
         self.picture.add_class("stad-lab-pixels")
         self.status = ipywidgets.HTML()
-        self.go = ipywidgets.ToggleButton(description="drive", icon="play", layout={"width": "240px"})
+        self.go = ipywidgets.ToggleButton(
+            description="drive", icon="play", layout={"width": "240px"}
+        )
         self.driver = choice({"you": "hand", "the agent": "agent"}, session.driver)
         self.world = choice({"the real track": "real", "the dream": "dream"}, session.world)
-        self.temperature = ipywidgets.FloatSlider(session.dream.temperature, min=0.1, max=2.5, step=0.05)
+        self.temperature = ipywidgets.FloatSlider(
+            session.dream.temperature, min=0.1, max=2.5, step=0.05
+        )
         self.speed = ipywidgets.IntSlider(30, min=10, max=50)
-        self.track = ipywidgets.BoundedIntText(session.track, min=0, max=999_999, layout={"width": "110px"})
+        self.track = ipywidgets.BoundedIntText(
+            session.track, min=0, max=999_999, layout={"width": "110px"}
+        )
         self.begin = ipywidgets.Button(description="begin", icon="flag", layout={"width": "124px"})
         # The browser copies every tenth picture's number back: without an answer, pictures would pile up in a slow one.
         self.shown, self.sent, self.seen = 0, ipywidgets.IntText(), ipywidgets.IntText()
         self.answer = ipywidgets.jsdlink((self.sent, "value"), (self.seen, "value"))
         self._connect()
         self.show()
-        self.view = ipywidgets.Box([self.picture, self._controls()], layout={"flex_flow": "row wrap"})
+        self.view = ipywidgets.Box(
+            [self.picture, self._controls()], layout={"flex_flow": "row wrap"}
+        )
 
     def _controls(self) -> ipywidgets.VBox:
         pedals = {pedal: self._pedal(pedal, icon) for pedal, icon in PEDAL_ICONS.items()}
@@ -107,15 +133,21 @@ class Seat:
             named("temperature of the dream", self.temperature),
             named("frames a second (the real car: 50)", self.speed),
             named("track", ipywidgets.HBox([self.track, self.begin])),
-            ipywidgets.VBox([pedals["gas"], below], layout={"align_items": "center", "width": "240px"}),
+            ipywidgets.VBox(
+                [pedals["gas"], below], layout={"align_items": "center", "width": "240px"}
+            ),
             ipywidgets.HTML(HELP),
         ]
         return ipywidgets.VBox(rows, layout={"width": "330px", "margin": "0 0 0 16px"})
 
     def _pedal(self, pedal: str, icon: str) -> ipywidgets.Button:
         """A button that holds its pedal for as long as a mouse or a finger holds the button."""
-        button = ipywidgets.Button(icon=icon, tooltip=pedal, layout={"width": "76px", "height": "40px"})
-        event = Event(source=button, watched_events=[*PRESSED, *RELEASED], prevent_default_action=True)
+        button = ipywidgets.Button(
+            icon=icon, tooltip=pedal, layout={"width": "76px", "height": "40px"}
+        )
+        event = Event(
+            source=button, watched_events=[*PRESSED, *RELEASED], prevent_default_action=True
+        )
         event.on_dom_event(lambda happened: self.press(pedal, happened["type"] in PRESSED))
         return button
 
@@ -123,7 +155,9 @@ class Seat:
         self.go.observe(lambda change: self.drive(change["new"]), "value")
         self.driver.observe(lambda change: self._command(self.session.give, change["new"]), "value")
         self.world.observe(lambda change: self._command(self.session.enter, change["new"]), "value")
-        self.temperature.observe(lambda change: setattr(self.session.dream, "temperature", change["new"]), "value")
+        self.temperature.observe(
+            lambda change: setattr(self.session.dream, "temperature", change["new"]), "value"
+        )
         self.begin.on_click(lambda _: self.begin_track())
         watched = ["keydown", "keyup", "mouseenter", "mouseleave"]
         self.keys = Event(source=self.picture, watched_events=watched, prevent_default_action=True)
@@ -141,7 +175,9 @@ class Seat:
             self.go.value = not self.go.value
         elif kind == "keydown" and not event.get("repeat") and key == "KeyT":
             self._command(self.session.give, "agent" if self.session.driver == "hand" else "hand")
-            self.driver.value = self.session.driver  # the buttons may have been behind: another cell can `give`
+            self.driver.value = (
+                self.session.driver
+            )  # the buttons may have been behind: another cell can `give`
 
     def press(self, pedal: str, down: bool) -> None:
         """Hold a pedal, or let it go."""
@@ -188,7 +224,9 @@ class Seat:
             self.sent.value = self.shown
         if time.perf_counter() - self.told > every:
             self.told = time.perf_counter()
-            self.status.value = describe(self.session, self.pace if self.go.value else 0.0, self.error)
+            self.status.value = describe(
+                self.session, self.pace if self.go.value else 0.0, self.error
+            )
 
     def browser_is_behind(self) -> bool:
         """Whether a browser is there and has not answered for more than 15 pictures."""
@@ -209,7 +247,13 @@ def describe(session: Session, pace: float, error: str = "") -> str:
     else:
         where, count = "in the dream", len(session.dream_rows)
         score = "no points in the dream"
-    state = "the episode has ended" if session.ended else f"{pace:.0f} pictures a second" if pace else "paused"
+    state = (
+        "the episode has ended"
+        if session.ended
+        else f"{pace:.0f} pictures a second"
+        if pace
+        else "paused"
+    )
     held = ", ".join(sorted(session.hand.held)) or "none"
     line = f"<b>{who} {where}</b><br>{score}, frame {count}, {state}<br>keys held: {held}"
     return f'<div style="line-height: 1.4">{line}{f"<br><b>{html.escape(error)}</b>" if error else ""}</div>'
@@ -217,7 +261,9 @@ def describe(session: Session, pace: float, error: str = "") -> str:
 
 def named(name: str, control: ipywidgets.Widget) -> ipywidgets.VBox:
     """A control under its name."""
-    return ipywidgets.VBox([ipywidgets.Label(name, layout={"margin": "0", "height": "20px"}), control])
+    return ipywidgets.VBox(
+        [ipywidgets.Label(name, layout={"margin": "0", "height": "20px"}), control]
+    )
 
 
 def choice(options: dict[str, str], value: str) -> ipywidgets.ToggleButtons:

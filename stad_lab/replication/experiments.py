@@ -55,23 +55,33 @@ def make_rows() -> dict[str, Row]:
     one = Settings.preset("laptop", crop_bar=False)
     # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
     first = dataclasses.replace(one, generations=15)
-    second = dataclasses.replace(first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5)
+    second = dataclasses.replace(
+        first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5
+    )
     for variant in VARIANTS:
         rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
     # Before the ceiling: 900 + 15 x 64 + 3 x 16 = 1,908 episodes.
     for variant in VARIANTS:
-        rows[f"early_{variant}"] = Row(variant, "the first round of our recipe", first, seeds=EARLY, retrained=True)
+        rows[f"early_{variant}"] = Row(
+            variant, "the first round of our recipe", first, seeds=EARLY, retrained=True
+        )
     # 15 x 256 + 3 x 16 episodes more, and 480 agents: 8,594 episodes and 4,000 agents in all.
     finished = dataclasses.replace(second, **FINISH)
     for variant in VARIANTS:
         base = f"two_rounds_{variant}"
         rows[f"finished_{variant}"] = Row(variant, "our recipe and a finish", finished, base=base)
     longer = dataclasses.replace(second, generations=160, sigma_decay=0.99)
-    rows["long_input"] = Row("input", "our recipe, four times as long", longer, first, (0,), "two_rounds_input")
+    rows["long_input"] = Row(
+        "input", "our recipe, four times as long", longer, first, (0,), "two_rounds_input"
+    )
     never_back = dataclasses.replace(second, revisited_share=0.0)
-    rows["two_rounds_new_tracks"] = Row("input", "our recipe, new tracks alone", never_back, first, seeds=(0,))
+    rows["two_rounds_new_tracks"] = Row(
+        "input", "our recipe, new tracks alone", never_back, first, seeds=(0,)
+    )
     before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]
-    rows["two_rounds_few_agents"] = Row("input", "our recipe before it was improved", *before, seeds=(0,))
+    rows["two_rounds_few_agents"] = Row(
+        "input", "our recipe before it was improved", *before, seeds=(0,)
+    )
     rows["one_round"] = Row("input", "one round", one)
     for name, (about, changes, world) in ABLATIONS.items():
         settings = dataclasses.replace(rows[world or "one_round"].settings, **changes)
@@ -80,7 +90,9 @@ def make_rows() -> dict[str, Row]:
     rows["no_bar"] = dataclasses.replace(rows["no_bar"], seeds=NO_BAR_SEEDS, retrained=True)
     for variant, what in NO_BAR.items():
         about = f"{rows['no_bar'].about}, {what}"
-        rows[f"no_bar_{variant}"] = dataclasses.replace(rows["no_bar"], variant=variant, about=about)
+        rows[f"no_bar_{variant}"] = dataclasses.replace(
+            rows["no_bar"], variant=variant, about=about
+        )
     return rows
 
 
@@ -100,12 +112,20 @@ ABLATIONS = {
     "no_M": ("one round, C sees z alone", {"features": "z"}, "one_round"),
     "no_z": ("one round, C sees h alone", {"features": "h"}, "one_round"),
     "untrained_M": ("one round, M's weights are random", {"m_steps": 0}, "one_round"),
-    "few_agents": ("one round, 16 agents on 4 tracks each", {"population": 16, "tracks": 4}, "one_round"),
+    "few_agents": (
+        "one round, 16 agents on 4 tracks each",
+        {"population": 16, "tracks": 4},
+        "one_round",
+    ),
     "another_V": ("one round, all of it from another seed", {"seed": 1}, None),
     "last_mean": ("one round, the last CMA mean alone", {"averaged_share": 0.0}, "another_V"),
     "every_weight": ("one round, every weight of C searched", {"components": 0}, "another_V"),
     "own_sigma": ("one round, CMA-ES's own step size", {"sigma_decay": 0.0}, "another_V"),
-    "no_bar": ("one round, the indicator bar cut off: the laptop settings", {"crop_bar": True}, None),
+    "no_bar": (
+        "one round, the indicator bar cut off: the laptop settings",
+        {"crop_bar": True},
+        None,
+    ),
     **{f"stride_{k}": (f"one round, stride {k}", {"stride": k}, None) for k in (1, 2, 8)},
     **{f"latent_{n}": (f"one round, {n} latents", {"latent_size": n}, None) for n in (16, 64)},
 }
@@ -132,5 +152,7 @@ def find_row(name: str, seeds: Sequence[int] | None = None) -> Row:
     row = ROWS[name]
     for seed in seeds or ():
         if seed not in row.seeds:
-            raise ValueError(f"row {name!r} has no seed {seed}: choose of {', '.join(map(str, row.seeds))}")
+            raise ValueError(
+                f"row {name!r} has no seed {seed}: choose of {', '.join(map(str, row.seeds))}"
+            )
     return dataclasses.replace(row, seeds=tuple(dict.fromkeys(seeds))) if seeds else row

@@ -46,7 +46,10 @@ TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is
 
 
 def replicate(
-    name: str, folder: str | Path, executor: Executor | None = None, seeds: Sequence[int] | None = None
+    name: str,
+    folder: str | Path,
+    executor: Executor | None = None,
+    seeds: Sequence[int] | None = None,
 ) -> dict:
     """Make one row of the table, or what is missing of it; run it again after an interrupt to go on.
 
@@ -74,7 +77,9 @@ def replicate(
             train(row.variant, row.settings_of(seed), own, executor=executor)
             evaluate_row(row, own, executor)
     else:
-        first, world = make_world(ROWS[row.world] if row.world else row, folder / (row.world or name), executor)
+        first, world = make_world(
+            ROWS[row.world] if row.world else row, folder / (row.world or name), executor
+        )
         for seed, own in folders.items():
             search(row, seed, own, first, world, executor)
     return summarise_row(list(folders.values()))
@@ -86,10 +91,17 @@ def drive_floor(name: str, folder: Path, executor: Executor | None) -> dict:
         folder.mkdir(parents=True, exist_ok=True)
         begin, tracks = time.perf_counter(), list(range(TRACKS))
         with worker_processes(Settings().processes, executor) as executor:
-            driven = run_in_order(executor, drive_blindly, [(name, track) for track in tracks], name)
+            driven = run_in_order(
+                executor, drive_blindly, [(name, track) for track in tracks], name
+            )
         returns, lengths = (np.array(part) for part in zip(*driven, strict=True))
-        told = {"variant": name, "renderer": "none: it does not look"} | report(tracks, returns, lengths)
-        record = {"variant": name, "made_with": provenance(f"python -m stad_lab replicate --row {name} --out ...")}
+        told = {"variant": name, "renderer": "none: it does not look"} | report(
+            tracks, returns, lengths
+        )
+        record = {
+            "variant": name,
+            "made_with": provenance(f"python -m stad_lab replicate --row {name} --out ..."),
+        }
         save_json(folder / "record.json", record | {"budget": {}})
         save_json(folder / "evaluation.json", told | {"seconds": time.perf_counter() - begin})
     return summarise_row([folder])
@@ -135,7 +147,9 @@ def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path 
     return first, world
 
 
-def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, executor: Executor | None) -> None:
+def search(
+    row: Row, seed: int, folder: Path, first: Path | None, world: Path, executor: Executor | None
+) -> None:
     """Search for C with one seed, and drive what was found on the official tracks.
 
     Where a search begins, and along which components, depends on the world alone: the first seed finds it for all,
@@ -144,12 +158,25 @@ def search(row: Row, seed: int, folder: Path, first: Path | None, world: Path, e
     folder.mkdir(parents=True, exist_ok=True)
     trained = ("autoencoder", "mdn_rnn") if row.settings.m_steps else ("autoencoder",)
     made = [world / f"{part}.safetensors" for part in trained]
-    alike = [seed for seed in seed_folders(folder.parent) if all(same_file(seed / file.name, file) for file in made)]
-    found = [seed / name for seed in alike for name in (COMPONENTS, START) if (seed / name).exists()]
+    alike = [
+        seed
+        for seed in seed_folders(folder.parent)
+        if all(same_file(seed / file.name, file) for file in made)
+    ]
+    found = [
+        seed / name for seed in alike for name in (COMPONENTS, START) if (seed / name).exists()
+    ]
     for source in made + found:
         if not (folder / source.name).exists():
             copy_file(source, folder)
-    train(row.variant, row.settings_of(seed), folder, world / "rollouts", executor=executor, earlier=first)
+    train(
+        row.variant,
+        row.settings_of(seed),
+        folder,
+        world / "rollouts",
+        executor=executor,
+        earlier=first,
+    )
     evaluate_row(row, folder, executor)
 
 
@@ -161,13 +188,20 @@ def same_file(one: Path, other: Path) -> bool:
 def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
     """Drive what a search found on the official tracks, and write `evaluation.json`, if that does not tell of it."""
     path, found = folder / "evaluation.json", checksum((folder / CONTROLLER).read_bytes())
-    if not path.exists() or load_json(path, "run the same command again")["controller_sha256"] != found:
+    if (
+        not path.exists()
+        or load_json(path, "run the same command again")["controller_sha256"] != found
+    ):
         unfinished = folder / "unfinished-evaluation.json"
-        save_json(path, evaluate(row.variant, folder, TRACKS, executor=executor, unfinished=unfinished))
+        save_json(
+            path, evaluate(row.variant, folder, TRACKS, executor=executor, unfinished=unfinished)
+        )
         unfinished.unlink(missing_ok=True)
 
 
-def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[int] | None = None) -> list[Path]:
+def keep(
+    name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[int] | None = None
+) -> list[Path]:
     """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
 
     With them go the records and the losses of the first round and of the world, if the row has its own. Seeds that are
@@ -186,7 +220,9 @@ def keep(name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[
             copy_records(source, kept[-1])
     seed_0 = Path(folder) / name / "seed0"
     with_seed_0 = bool(kept) and (seed_0 / "evaluation.json").exists()
-    known = worlds(kept) <= worlds([path for path in seed_folders(target / name) if path not in kept])
+    known = worlds(kept) <= worlds(
+        [path for path in seed_folders(target / name) if path not in kept]
+    )
     for part in ("first", "world"):
         if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
             own = part if with_seed_0 else f"{part}_of_{kept[0].name}"
@@ -208,7 +244,10 @@ def remove_twins(row: Path, seed_0: Path) -> None:
 def keep_histories(source: Path, target: Path) -> None:
     """Write how the losses of V and M went, which their weights tell and which stay behind: `histories.json`."""
     files = {part: source / f"{part}.safetensors" for part in ("autoencoder", "mdn_rnn")}
-    save_json(target / "histories.json", {part: load_tensors(file)[1]["history"] for part, file in files.items()})
+    save_json(
+        target / "histories.json",
+        {part: load_tensors(file)[1]["history"] for part, file in files.items()},
+    )
 
 
 def copy_records(source: Path, target: Path) -> None:
@@ -231,13 +270,22 @@ def time_needed(name: str, seeds: Sequence[int] | None = None) -> dict[str, floa
     if row.base:
         times, before = time_needed(row.base, row.seeds), ROWS[row.base].settings
         longer = most_frames(row.settings) / most_frames(before)
-        return times | {"finishes": times["searches"] * longer, "evaluations": 2 * times["evaluations"]}
+        return times | {
+            "finishes": times["searches"] * longer,
+            "evaluations": 2 * times["evaluations"],
+        }
     with tempfile.TemporaryDirectory() as folder:
         speed = speeds(row, Path(folder))
     made = ROWS[row.world] if row.world else row
-    rounds = [made.first, made.settings] if made.first else [made.settings] * (len(row.seeds) if row.retrained else 1)
+    rounds = (
+        [made.first, made.settings]
+        if made.first
+        else [made.settings] * (len(row.seeds) if row.retrained else 1)
+    )
     return {
-        "rollouts": sum(s.episodes * s.episode_frames + s.agent_episodes * s.max_frames for s in rounds)
+        "rollouts": sum(
+            s.episodes * s.episode_frames + s.agent_episodes * s.max_frames for s in rounds
+        )
         / speed["V, M, C"],
         "V": sum(s.v_steps * s.v_batch for s in rounds) / speed["V"],
         "M": sum(s.m_steps * s.m_batch * s.m_sequence for s in rounds) / speed["M"],
@@ -250,7 +298,9 @@ def time_needed(name: str, seeds: Sequence[int] | None = None) -> dict[str, floa
 def most_frames(settings: Settings) -> int:
     """How many frames a search for C drives at most, with its looks at the validation tracks."""
     looks = settings.generations // settings.validate_every * settings.validation_tracks
-    return (settings.generations * settings.population * settings.tracks + looks) * settings.max_frames
+    return (
+        settings.generations * settings.population * settings.tracks + looks
+    ) * settings.max_frames
 
 
 def speeds(row: Row, folder: Path) -> dict[str, float]:
@@ -265,7 +315,9 @@ def speeds(row: Row, folder: Path) -> dict[str, float]:
     with worker_processes(settings.processes) as executor:
         for _ in range(2):  # the first time workers start
             begin = time.perf_counter()
-            entry = drive_generation(executor, folder, row.variant, brief, [], np.tile(start, (settings.population, 1)))
+            entry = drive_generation(
+                executor, folder, row.variant, brief, [], np.tile(start, (settings.population, 1))
+            )
             driven = entry["frames"] / (time.perf_counter() - begin)
     env = make_env(fast=False)
     env.reset(seed=0)
@@ -290,10 +342,10 @@ def blind_speed(name: str) -> float:
 
 def describe_time(name: str, times: dict[str, float]) -> str:
     """One line that says how long a row takes."""
-    parts = ", ".join(f"{part} {seconds / 60:.0f} min" for part, seconds in times.items() if seconds)
-    return (
-        f"{name}: at most {sum(times.values()) / 3600:.1f} hours on this machine, if nothing of it is there ({parts})"
+    parts = ", ".join(
+        f"{part} {seconds / 60:.0f} min" for part, seconds in times.items() if seconds
     )
+    return f"{name}: at most {sum(times.values()) / 3600:.1f} hours on this machine, if nothing of it is there ({parts})"
 
 
 def describe_row(name: str, found: dict) -> str:

@@ -49,15 +49,31 @@ from stad_lab.evaluation.trajectories import (
 )
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.workers import run_in_order, worker_processes
-from stad_lab.models.mdn_rnn import MDNRNN, check_partner, encode_rollouts, fit_mdn_rnn, load_mdn_rnn, sample_latents
-from stad_lab.models.vae import VARIANTS, AutoEncoder, check_facts, check_variant, kl_divergence, load_autoencoder
+from stad_lab.models.mdn_rnn import (
+    MDNRNN,
+    check_partner,
+    encode_rollouts,
+    fit_mdn_rnn,
+    load_mdn_rnn,
+    sample_latents,
+)
+from stad_lab.models.vae import (
+    VARIANTS,
+    AutoEncoder,
+    check_facts,
+    check_variant,
+    kl_divergence,
+    load_autoencoder,
+)
 from stad_lab.training.dataset import Rollouts, collect_rollouts, track_seeds
 from stad_lab.training.pipeline import open_record, provenance, train
 from stad_lab.training.trainer import training_device
 
 STRIDES = (1, 2, 4, 8)
 KL_WEIGHTS = (0.02, 0.08, 0.25, 1.0, 4.0, 16.0)
-SHORTER = 0.3  # the V's of the comparisons are trained for this share of the steps, all of them alike
+SHORTER = (
+    0.3  # the V's of the comparisons are trained for this share of the steps, all of them alike
+)
 CONTENDERS = {  # lesser M's: what is changed, and whether they see the actions
     "one Gaussian": ({"mixtures": 1}, True),
     "no actions": ({}, False),
@@ -67,11 +83,31 @@ DRIVE_FRAMES, AGENT_FRAMES = 150, 360  # of a drive of the random driver, and of
 # Frames of a drive that are not probed: without a difference image, or with the opening zoom, which tells the speed.
 RANDOM_SKIP, AGENT_SKIP = max(STRIDES), 60
 FEWEST_DRIVES = 12  # a probe is fitted on some and measured on others
-PROBE_DRIVES, PROBE_SEED = 180, 100  # of the random driver, when a run is probed; no rollouts of ours have this seed
+PROBE_DRIVES, PROBE_SEED = (
+    180,
+    100,
+)  # of the random driver, when a run is probed; no rollouts of ours have this seed
 STUDY_COMMAND = "python -m stad_lab study --settings {} --part {} --out ..."
 RECORD = Path(__file__).parents[1] / "records" / "study.json"  # the study that we report
 AWAKE = 30  # frames that M sees before a dream
-HORIZON = [1, 2, 3, 5, 7, 10, 14, 20, 30, 40, 50, 60, 70, 80, 90, 100]  # dreamed steps at which it is judged
+HORIZON = [
+    1,
+    2,
+    3,
+    5,
+    7,
+    10,
+    14,
+    20,
+    30,
+    40,
+    50,
+    60,
+    70,
+    80,
+    90,
+    100,
+]  # dreamed steps at which it is judged
 DRIVE_RESAMPLES = 1000  # of the drives, for an interval
 DREAMERS = 60  # drives in which M falls asleep
 
@@ -90,12 +126,19 @@ def study(settings: Settings, rollouts_folder: Path, work: Path, parts: list[str
     """
     check_parts(parts)
     collect_rollouts(settings, rollouts_folder)
-    drives = random_drives(max(FEWEST_DRIVES, settings.episodes // 5), settings.seed + 1, settings.processes)
+    drives = random_drives(
+        max(FEWEST_DRIVES, settings.episodes // 5), settings.seed + 1, settings.processes
+    )
     file, result = Path(work) / "study.json", {}
     for name in parts:
         found = PARTS[name](settings, Path(rollouts_folder), Path(work), drives)
         made_with = provenance(STUDY_COMMAND.format(settings.name, name))
-        result[name] = {**found, "drives": len(drives), "settings": settings.as_dict(), "made_with": made_with}
+        result[name] = {
+            **found,
+            "drives": len(drives),
+            "settings": settings.as_dict(),
+            "made_with": made_with,
+        }
         save_json(file, (load_json(file) if file.exists() else {}) | result)
     return result
 
@@ -112,8 +155,12 @@ def random_drives(count: int, seed: int, processes: int) -> list[Drive]:
 
     With the seed of some rollouts its hand would do there what it did in those.
     """
-    settings = Settings.preset("laptop", seed=seed, episodes=count, episode_frames=DRIVE_FRAMES, random_starts=1.0)
-    return record_all(functools.partial(record_random_drive, settings), list(range(count)), "random", processes)
+    settings = Settings.preset(
+        "laptop", seed=seed, episodes=count, episode_frames=DRIVE_FRAMES, random_starts=1.0
+    )
+    return record_all(
+        functools.partial(record_random_drive, settings), list(range(count)), "random", processes
+    )
 
 
 def agent_drives(count: int, processes: int) -> list[Drive]:
@@ -121,7 +168,9 @@ def agent_drives(count: int, processes: int) -> list[Drive]:
     return record_all(begin_agent_drive, track_seeds("inspect", count, 2), "agent", processes)
 
 
-def record_all(record: Callable[[int], Drive], numbers: list[int], label: str, processes: int) -> list[Drive]:
+def record_all(
+    record: Callable[[int], Drive], numbers: list[int], label: str, processes: int
+) -> list[Drive]:
     """`record` of every number, in worker processes."""
     with worker_processes(processes) as executor:
         return run_in_order(executor, record, [(number,) for number in numbers], f"{label} drives")
@@ -134,20 +183,29 @@ def begin_agent_drive(track: int) -> Drive:
 
 def probe_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
     """Probe the latents of every variant, and of every stride, for the true motion, under two drivers."""
-    strides = {str(stride): shorter_autoencoder(settings, rollouts_folder, work, stride=stride) for stride in STRIDES}
+    strides = {
+        str(stride): shorter_autoencoder(settings, rollouts_folder, work, stride=stride)
+        for stride in STRIDES
+    }
     drivers = two_drivers(drives, settings.processes)
     result = {"variants": probe_variants(settings, PRETRAINED, drivers), "strides": {}}
     for driver, (driven, skip) in drivers.items():
         found = result["strides"][driver] = {}
         for stride, autoencoder in strides.items():
-            found[stride] = probe_drives(driven, skip, autoencoder, {}, int(stride), settings.crop_bar)
+            found[stride] = probe_drives(
+                driven, skip, autoencoder, {}, int(stride), settings.crop_bar
+            )
     return result
 
 
 def bar_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
     """Probe the latents of the second rounds' V and M as `probe_part` does: do they hold the gauges of the bar?"""
     with_bar = dataclasses.replace(settings, crop_bar=False)
-    return {"variants": probe_variants(with_bar, PRETRAINED / "second_round", two_drivers(drives, settings.processes))}
+    return {
+        "variants": probe_variants(
+            with_bar, PRETRAINED / "second_round", two_drivers(drives, settings.processes)
+        )
+    }
 
 
 def two_drivers(drives: list[Drive], processes: int) -> dict[str, tuple[list[Drive], int]]:
@@ -156,14 +214,18 @@ def two_drivers(drives: list[Drive], processes: int) -> dict[str, tuple[list[Dri
     return {"random driver": (drives, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
 
 
-def probe_variants(settings: Settings, home: Path, drivers: dict[str, tuple[list[Drive], int]]) -> dict:
+def probe_variants(
+    settings: Settings, home: Path, drivers: dict[str, tuple[list[Drive], int]]
+) -> dict:
     """Probe V and M of every variant in `home`, and V's and an M with random weights: driver -> source -> features."""
     torch.manual_seed(settings.seed)
     untrained = {
         f"{name}, untrained": AutoEncoder(name, settings.latent_size, settings.width)
         for name in ("frame", "input_output")
     }
-    untrained_mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures).requires_grad_(False)
+    untrained_mdn_rnn = MDNRNN(
+        settings.latent_size, settings.hidden_size, settings.mixtures
+    ).requires_grad_(False)
     result = {}
     for driver, (driven, skip) in drivers.items():
         found = result[driver] = {}
@@ -172,12 +234,19 @@ def probe_variants(settings: Settings, home: Path, drivers: dict[str, tuple[list
             memories = {"z, h": mdn_rnn, "z, h of an untrained M": untrained_mdn_rnn}
             found[variant] = probe_drives(driven, skip, autoencoder, memories, stride, crop_bar)
         for name, autoencoder in untrained.items():
-            found[name] = probe_drives(driven, skip, autoencoder, {}, settings.stride, settings.crop_bar)
+            found[name] = probe_drives(
+                driven, skip, autoencoder, {}, settings.stride, settings.crop_bar
+            )
     return result
 
 
 def probe_drives(
-    drives: list[Drive], skip: int, autoencoder: AutoEncoder, memories: dict[str, MDNRNN], stride: int, crop_bar: bool
+    drives: list[Drive],
+    skip: int,
+    autoencoder: AutoEncoder,
+    memories: dict[str, MDNRNN],
+    stride: int,
+    crop_bar: bool,
 ) -> dict:
     """Probe the mean of z, which C is given, and z with what M's remember.
 
@@ -192,11 +261,16 @@ def probe_drives(
     latents = [encode_drive(autoencoder, drive, stride, crop_bar)[0] for drive in drives]
     features = {"z": np.concatenate(latents)}
     for name, mdn_rnn in memories.items():
-        hidden = [remember_drive(mdn_rnn, z, drive.actions) for z, drive in zip(latents, drives, strict=True)]
+        hidden = [
+            remember_drive(mdn_rnn, z, drive.actions)
+            for z, drive in zip(latents, drives, strict=True)
+        ]
         features[name] = np.concatenate([features["z"], np.concatenate(hidden)], axis=1)
     motion = np.concatenate([drive.motion for drive in drives])
     number = np.repeat(np.arange(len(drives)), [len(drive) for drive in drives])
-    kept = road_in_sight(motion) & (np.concatenate([np.arange(len(drive)) for drive in drives]) >= skip)
+    kept = road_in_sight(motion) & (
+        np.concatenate([np.arange(len(drive)) for drive in drives]) >= skip
+    )
     result = {}
     for name, seen in features.items():
         found = probe(seen[kept], motion[kept], number[kept])
@@ -207,7 +281,9 @@ def probe_drives(
     return result
 
 
-def probe_run(variant: str, path: str | Path | None = None, drives: int = PROBE_DRIVES, processes: int = 2) -> dict:
+def probe_run(
+    variant: str, path: str | Path | None = None, drives: int = PROBE_DRIVES, processes: int = 2
+) -> dict:
     """Probe V and M of one run for the true motion, under the study's two drivers: what do *these* latents know?
 
     Args:
@@ -226,8 +302,12 @@ def probe_run(variant: str, path: str | Path | None = None, drives: int = PROBE_
     """
     check_variant(variant)
     if drives < FEWEST_DRIVES:
-        raise ValueError(f"drives={drives}: expected at least {FEWEST_DRIVES}, so that the probe has unseen ones")
-    autoencoder, mdn_rnn, stride, crop_bar, identities = load_world_model(run_folder(variant, path), variant)
+        raise ValueError(
+            f"drives={drives}: expected at least {FEWEST_DRIVES}, so that the probe has unseen ones"
+        )
+    autoencoder, mdn_rnn, stride, crop_bar, identities = load_world_model(
+        run_folder(variant, path), variant
+    )
     drivers = two_drivers(random_drives(drives, PROBE_SEED, processes), processes)
     return {
         "variant": variant,
@@ -256,14 +336,19 @@ def probe_panels(found: dict) -> dict:
     """What `probe_part` found under one driver, as `plots.plot_intervals` wants it: quantity -> source -> features."""
     return {
         quantity: {
-            source: {name: (r2s[quantity]["r2"], r2s[quantity]["interval"]) for name, r2s in by_features.items()}
+            source: {
+                name: (r2s[quantity]["r2"], r2s[quantity]["interval"])
+                for name, r2s in by_features.items()
+            }
             for source, by_features in found.items()
         }
         for quantity in MOTION
     }
 
 
-def shorter_autoencoder(settings: Settings, rollouts_folder: Path, work: Path, **change) -> AutoEncoder:
+def shorter_autoencoder(
+    settings: Settings, rollouts_folder: Path, work: Path, **change
+) -> AutoEncoder:
     """V of the variant `input_output`, trained with one change for a share of the steps; loaded if it is there."""
     ((name, value),) = change.items()
     if value == getattr(settings, name):  # no change: one training serves all comparisons
@@ -274,17 +359,23 @@ def shorter_autoencoder(settings: Settings, rollouts_folder: Path, work: Path, *
     return load_autoencoder(folder / "autoencoder.safetensors", "input_output")[0]
 
 
-def autoencoder_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
+def autoencoder_part(
+    settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]
+) -> dict:
     """Measure V of every variant, and rate against distortion."""
 
     def measure(autoencoder: AutoEncoder, stride: int, crop_bar: bool) -> dict:
         films = [drive.frames(crop_bar) for drive in drives]
         pairs = [(film[stride::3], earlier_frames(film, stride)[stride::3]) for film in films]
-        return autoencoder_quality(autoencoder, *(np.concatenate(part) for part in zip(*pairs, strict=True)))
+        return autoencoder_quality(
+            autoencoder, *(np.concatenate(part) for part in zip(*pairs, strict=True))
+        )
 
     variants = {}
     for variant in VARIANTS:
-        autoencoder, facts = load_autoencoder(PRETRAINED / variant / "autoencoder.safetensors", variant)
+        autoencoder, facts = load_autoencoder(
+            PRETRAINED / variant / "autoencoder.safetensors", variant
+        )
         variants[variant] = measure(autoencoder, facts["stride"], facts["crop_bar"])
     rate_distortion = {}
     for weight in KL_WEIGHTS:
@@ -293,7 +384,9 @@ def autoencoder_part(settings: Settings, rollouts_folder: Path, work: Path, driv
     return {"variants": variants, "rate_distortion": rate_distortion}
 
 
-def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]) -> dict:
+def mdn_rnn_part(
+    settings: Settings, rollouts_folder: Path, work: Path, drives: list[Drive]
+) -> dict:
     """Measure M of every variant; for `input` also the lesser M's."""
     whole = [drive for drive in drives if len(drive) == DRIVE_FRAMES]
     actions = np.array([drive.actions for drive in whole])
@@ -303,10 +396,16 @@ def mdn_rnn_part(settings: Settings, rollouts_folder: Path, work: Path, drives: 
         autoencoder, mdn_rnn, stride, crop_bar, _ = world_model
         mu, logvar = (
             np.array(part)
-            for part in zip(*(encode_drive(autoencoder, drive, stride, crop_bar) for drive in whole), strict=True)
+            for part in zip(
+                *(encode_drive(autoencoder, drive, stride, crop_bar) for drive in whole),
+                strict=True,
+            )
         )
         z = sample_latents(mu, logvar, np.random.default_rng(0))
-        active = kl_divergence(torch.from_numpy(mu), torch.from_numpy(logvar)).mean(dim=(0, 1)).numpy() > ACTIVE
+        active = (
+            kl_divergence(torch.from_numpy(mu), torch.from_numpy(logvar)).mean(dim=(0, 1)).numpy()
+            > ACTIVE
+        )
         mixture = forecast(mdn_rnn, z, actions)
         counts, _ = np.histogram(pit(mixture, z)[..., active], bins=20, range=(0, 1))
         dreamed = dream_with(mdn_rnn, mu[:DREAMERS], actions[:DREAMERS], AWAKE)
@@ -336,7 +435,10 @@ def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
         Name -> {"nats": mean, "interval": of it, "more_than_M": interval of the difference}, by bootstrap over drives.
     """
     frames = min(found.shape[1] for found in nll.values())
-    means = {name: found[len(found) // 2 :, -frames:, active].mean(axis=(1, 2)) for name, found in nll.items()}
+    means = {
+        name: found[len(found) // 2 :, -frames:, active].mean(axis=(1, 2))
+        for name, found in nll.items()
+    }
     return {
         name: {
             "nats": float(found.mean()),
@@ -359,7 +461,12 @@ def simple_forecasts(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray
 
 
 def lesser_forecasts(
-    settings: Settings, rollouts_folder: Path, work: Path, world_model: WorldModel, z: np.ndarray, actions: np.ndarray
+    settings: Settings,
+    rollouts_folder: Path,
+    work: Path,
+    world_model: WorldModel,
+    z: np.ndarray,
+    actions: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """NLL of M's that lack something, trained like the whole one."""
     rollouts, encoded, result = Rollouts(rollouts_folder), None, {}
@@ -367,12 +474,20 @@ def lesser_forecasts(
     for name, (changes, sees_actions) in CONTENDERS.items():
         path = work / name.replace(" ", "_") / "mdn_rnn.safetensors"
         lesser = dataclasses.replace(settings, **changes)
-        lesser = dataclasses.replace(lesser, m_batch=settings.m_batch * settings.m_sequence // lesser.m_sequence)
-        record = open_record(path.parent, "input", lesser, STUDY_COMMAND.format(settings.name, "mdn_rnn"))
+        lesser = dataclasses.replace(
+            lesser, m_batch=settings.m_batch * settings.m_sequence // lesser.m_sequence
+        )
+        record = open_record(
+            path.parent, "input", lesser, STUDY_COMMAND.format(settings.name, "mdn_rnn")
+        )
         if not path.exists():
-            encoded = encoded or encode_rollouts(world_model.autoencoder, rollouts, world_model.stride)
+            encoded = encoded or encode_rollouts(
+                world_model.autoencoder, rollouts, world_model.stride
+            )
             torch.manual_seed(settings.seed)
-            mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures).to(training_device())
+            mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, lesser.mixtures).to(
+                training_device()
+            )
             shown = [action * sees_actions for action in rollouts.actions]
             fit_mdn_rnn(path, mdn_rnn, "input", identity, encoded, shown, rollouts, lesser)
             save_json(path.with_name("record.json"), record)
@@ -386,4 +501,9 @@ def lesser_forecasts(
     return result
 
 
-PARTS = {"probe": probe_part, "bar": bar_part, "autoencoder": autoencoder_part, "mdn_rnn": mdn_rnn_part}
+PARTS = {
+    "probe": probe_part,
+    "bar": bar_part,
+    "autoencoder": autoencoder_part,
+    "mdn_rnn": mdn_rnn_part,
+}

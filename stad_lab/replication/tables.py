@@ -25,8 +25,18 @@ from stad_lab.training.pipeline import total_budget
 
 RECORDS = Path(__file__).parents[1] / "records" / "table"
 # World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
-WORLD_MODELS = {25 * 64 * 16: 823.0, 50 * 64 * 16: 867.0, 200 * 64 * 16: 880.0, 1800 * 64 * 16: 900.5}
-PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # its table, on CarRacing-v0
+WORLD_MODELS = {
+    25 * 64 * 16: 823.0,
+    50 * 64 * 16: 867.0,
+    200 * 64 * 16: 880.0,
+    1800 * 64 * 16: 900.5,
+}
+PAPER = {
+    "frame": 827.0,
+    "input": 905.0,
+    "output": 906.0,
+    "input_output": 902.0,
+}  # its table, on CarRacing-v0
 OTHERS = {  # the rest of that table
     "Task-aware AE": 200.0,
     "DQN": 343.0,
@@ -77,18 +87,26 @@ def describe_table(rows: dict[str, list[Path]]) -> str:
     return "\n".join(lines)
 
 
-def claims_and_outcomes(rows: dict[str, list[Path]]) -> dict[str, dict[str, tuple[float, list[float], list[float]]]]:
+def claims_and_outcomes(
+    rows: dict[str, list[Path]],
+) -> dict[str, dict[str, tuple[float, list[float], list[float]]]]:
     """What the paper reports of each variant, and what came out here.
 
     Returns:
         variant -> "the paper, v0" or a name of RECIPES -> (mean return, its 95% interval, the mean of each search), for
         the rows that are made. The paper gives neither interval nor searches.
     """
-    scores = {variant: {"the paper, v0": (claim, [claim, claim], [])} for variant, claim in PAPER.items()}
+    scores = {
+        variant: {"the paper, v0": (claim, [claim, claim], [])} for variant, claim in PAPER.items()
+    }
     for variant, (recipe, told) in itertools.product(PAPER, RECIPES.items()):
         if f"{recipe}_{variant}" in rows:
             returns = official_returns(rows[f"{recipe}_{variant}"])
-            scores[variant][told] = float(returns.mean()), bootstrap(returns), returns.mean(axis=1).tolist()
+            scores[variant][told] = (
+                float(returns.mean()),
+                bootstrap(returns),
+                returns.mean(axis=1).tolist(),
+            )
     return scores
 
 
@@ -116,9 +134,17 @@ def lost_points(folders: list[Path]) -> dict[str, float]:
         episode to its last frame; only leaving the field shortens it. "tiles": those not visited, and the 100 points
         for leaving the field.
     """
-    episodes = [episode for folder in folders for episode in load_json(folder / "evaluation.json")["episodes"]]
-    returns, frames = (np.array([episode[name] for episode in episodes]) for name in ("return", "frames"))
-    laps = frames[returns >= SOLVED]  # 1,000 frames at most, so 900 points at least; and with a tile missing, fewer
+    episodes = [
+        episode
+        for folder in folders
+        for episode in load_json(folder / "evaluation.json")["episodes"]
+    ]
+    returns, frames = (
+        np.array([episode[name] for episode in episodes]) for name in ("return", "frames")
+    )
+    laps = frames[
+        returns >= SOLVED
+    ]  # 1,000 frames at most, so 900 points at least; and with a tile missing, fewer
     speed = laps.mean() if len(laps) else frames.mean()
     return {
         "speed": float(0.1 * speed),
@@ -160,7 +186,10 @@ def summarise_row(folders: list[Path]) -> dict:
         "seeds": returns.mean(axis=1).tolist(),
         "worlds": len(worlds(folders)),
         "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
-        **{unit: float(np.mean([spent[unit] for spent in budgets])) for unit in ("agents", "episodes", "frames")},
+        **{
+            unit: float(np.mean([spent[unit] for spent in budgets]))
+            for unit in ("agents", "episodes", "frames")
+        },
     }
 
 
@@ -176,7 +205,9 @@ def official_returns(folders: list[Path]) -> np.ndarray:
     return np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
 
 
-def bootstrap_gain(before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
+def bootstrap_gain(
+    before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES
+) -> list[float]:
     """95% interval of the mean of `after` less the mean of `before`, both returns (seeds, tracks) on the same tracks.
 
     Seeds are drawn anew for each of the two, tracks once for both: a long track costs both of them time. Of a row with

@@ -36,14 +36,24 @@ NPY_HEADER = 128  # bytes before the array in a file of np.save, where the array
 MANIFEST = "manifest.json"
 UNWRITTEN = 1e9  # bytes of episodes that may wait for the disk
 FRAME_BYTES = FRAME_SIZE**2 * 3 + 3 * 4  # of a frame and its action on the disk
-COLLECT_SETTINGS = ("seed", "crop_bar", "episodes", "episode_frames", "random_starts")  # what a dataset depends on
+COLLECT_SETTINGS = (
+    "seed",
+    "crop_bar",
+    "episodes",
+    "episode_frames",
+    "random_starts",
+)  # what a dataset depends on
 AGENT_SETTINGS = ("agent_episodes", "max_frames", "patience")  # and if an agent drives for it, too
 
 
 def track_seeds(use: str, count: int, *seed: int) -> list[int]:
     """Seeds of `count` tracks for one use, drawn from that use's own range with the random seed `seed`."""
     low, high = TRACK_RANGES[use]
-    return np.random.default_rng([list(TRACK_RANGES).index(use), *seed]).integers(low, high, count).tolist()
+    return (
+        np.random.default_rng([list(TRACK_RANGES).index(use), *seed])
+        .integers(low, high, count)
+        .tolist()
+    )
 
 
 class RandomDriver:
@@ -68,7 +78,9 @@ class RandomDriver:
         return np.array(action, np.float32)
 
 
-def begin_randomly(settings: Settings, index: int, use: str = "collect") -> tuple[gym.Env, np.ndarray, RandomDriver]:
+def begin_randomly(
+    settings: Settings, index: int, use: str = "collect"
+) -> tuple[gym.Env, np.ndarray, RandomDriver]:
     """Put the car where the random driver's episode number `index` begins.
 
     Most episodes start moving on a random tile, or the data would be nothing but the first bend and then grass.
@@ -108,10 +120,16 @@ def drive_randomly(settings: Settings, index: int) -> tuple[np.ndarray, np.ndarr
         if terminated or truncated:
             break
     env.close()
-    return np.array(frames), np.array(actions), track_seeds("collect", settings.episodes, settings.seed)[index]
+    return (
+        np.array(frames),
+        np.array(actions),
+        track_seeds("collect", settings.episodes, settings.seed)[index],
+    )
 
 
-def save_block(folder: Path, index: int, frames: np.ndarray, actions: np.ndarray, track: int) -> dict:
+def save_block(
+    folder: Path, index: int, frames: np.ndarray, actions: np.ndarray, track: int
+) -> dict:
     """Write an episode's block; returns its entry for the manifest."""
     entry = {"index": index, "track": track, "frames": len(frames)}
     for name, array in (("frames", frames), ("actions", actions)):
@@ -144,11 +162,23 @@ def collect_rollouts(settings: Settings, folder: Path, executor: Executor | None
     made_with = {field: getattr(settings, field) for field in COLLECT_SETTINGS}
     tasks = [(settings, index) for index in range(settings.episodes)]
     with worker_processes(settings.processes, executor) as executor:
-        return collect(folder, made_with, drive_randomly, tasks, [settings.episode_frames] * len(tasks), executor)
+        return collect(
+            folder,
+            made_with,
+            drive_randomly,
+            tasks,
+            [settings.episode_frames] * len(tasks),
+            executor,
+        )
 
 
 def collect(
-    folder: Path, made_with: dict, drive_episode: Callable, tasks: list[tuple], longest: list[int], executor: Executor
+    folder: Path,
+    made_with: dict,
+    drive_episode: Callable,
+    tasks: list[tuple],
+    longest: list[int],
+    executor: Executor,
 ) -> bool:
     """Drive the episodes that are not in `folder` yet, one for each task, and write their blocks.
 
@@ -163,7 +193,9 @@ def collect(
     if len(read_manifest(folder, made_with)["blocks"]) == len(tasks):
         return False
     with locked(folder):
-        manifest = read_manifest(folder, made_with)  # again: another process may have collected until now
+        manifest = read_manifest(
+            folder, made_with
+        )  # again: another process may have collected until now
         done = {entry["index"] for entry in manifest["blocks"]}
         missing = [index for index in range(len(tasks)) if index not in done]
         if not missing:
@@ -171,10 +203,16 @@ def collect(
         check_disk(folder, sum(longest[index] for index in missing) * FRAME_BYTES)
         save_json(folder / MANIFEST, manifest)
         ahead = max(8, int(UNWRITTEN / (max(longest) * FRAME_BYTES)))
-        episodes = run_tasks(executor, drive_episode, [tasks[index] for index in missing], ahead=ahead)
-        for number, episode in tqdm(episodes, "collect", len(tasks), initial=len(done), unit="episode"):
+        episodes = run_tasks(
+            executor, drive_episode, [tasks[index] for index in missing], ahead=ahead
+        )
+        for number, episode in tqdm(
+            episodes, "collect", len(tasks), initial=len(done), unit="episode"
+        ):
             entry = save_block(folder, missing[number], *episode)
-            manifest["blocks"] = sorted([*manifest["blocks"], entry], key=lambda entry: entry["index"])
+            manifest["blocks"] = sorted(
+                [*manifest["blocks"], entry], key=lambda entry: entry["index"]
+            )
             save_json(folder / MANIFEST, manifest)
     return True
 
@@ -196,7 +234,9 @@ def check_disk(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     room = f"rollouts: up to {needed / 1e9:.2f} GB in {folder}, where {free / 1e9:.2f} GB are free"
     if needed > free:
-        raise OSError(f"{room}: free some room, choose a folder on another disk, or collect fewer or shorter episodes")
+        raise OSError(
+            f"{room}: free some room, choose a folder on another disk, or collect fewer or shorter episodes"
+        )
     print(room)
 
 
@@ -221,7 +261,9 @@ class EpisodeFrames(Sequence):
             for moment, frame in zip(moments, into, strict=True):
                 file.seek(NPY_HEADER + moment * frame.nbytes)
                 if file.readinto(frame.data) < frame.nbytes:
-                    raise ValueError(f"{self.paths[index]} is shorter than it was: collect in another folder")
+                    raise ValueError(
+                        f"{self.paths[index]} is shorter than it was: collect in another folder"
+                    )
 
 
 def count_episodes(manifest: dict) -> tuple[int, int]:
@@ -243,7 +285,9 @@ def check_seen(path: Path, seen: str | None, folder: Path) -> None:
     """
     manifest = Path(folder) / MANIFEST
     if seen and manifest.exists() and seen != identity_of(load_json(manifest)):
-        raise ValueError(f"{path} was trained on other rollouts than those in {folder}: give its own ones")
+        raise ValueError(
+            f"{path} was trained on other rollouts than those in {folder}: give its own ones"
+        )
 
 
 class Rollouts:
@@ -262,7 +306,9 @@ class Rollouts:
 
     def __init__(self, folder: Path):
         self.folder = Path(folder)
-        remedy = f"collect the rollouts first: python -m stad_lab train ... --rollouts {self.folder}"
+        remedy = (
+            f"collect the rollouts first: python -m stad_lab train ... --rollouts {self.folder}"
+        )
         self.manifest = load_json(self.folder / MANIFEST, remedy)
         found, wanted = count_episodes(self.manifest)
         if found != wanted:
@@ -271,11 +317,17 @@ class Rollouts:
         self.identity = identity_of(self.manifest)
         for entry in blocks:
             self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
-        self.frames = EpisodeFrames([block_path(self.folder, entry["index"], "frames") for entry in blocks])
-        self.actions = [self._read(entry, "actions", (entry["frames"], 3), np.float32) for entry in blocks]
+        self.frames = EpisodeFrames(
+            [block_path(self.folder, entry["index"], "frames") for entry in blocks]
+        )
+        self.actions = [
+            self._read(entry, "actions", (entry["frames"], 3), np.float32) for entry in blocks
+        ]
         lengths = [entry["frames"] for entry in blocks]
         self.episode = np.repeat(np.arange(len(lengths)), lengths)  # of every frame in the dataset
-        self.moment = np.concatenate([np.arange(length) for length in lengths])  # its index in that episode
+        self.moment = np.concatenate(
+            [np.arange(length) for length in lengths]
+        )  # its index in that episode
 
     def _read(self, entry: dict, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
         path = block_path(self.folder, entry["index"], name)
@@ -284,10 +336,14 @@ class Rollouts:
             raise FileNotFoundError(f"{path} is missing although the manifest lists it: {remedy}")
         content = read_bytes(path, remedy)
         if checksum(content) != entry[f"{name}_sha256"]:
-            raise ValueError(f"{path} is damaged ({len(content)} bytes, not the checksum in the manifest): {remedy}")
+            raise ValueError(
+                f"{path} is damaged ({len(content)} bytes, not the checksum in the manifest): {remedy}"
+            )
         array = np.load(io.BytesIO(content), allow_pickle=False)
         if array.shape != shape or array.dtype != dtype:
-            raise ValueError(f"{path} holds {array.dtype} {array.shape}, the manifest says {shape}: {remedy}")
+            raise ValueError(
+                f"{path} holds {array.dtype} {array.shape}, the manifest says {shape}: {remedy}"
+            )
         return array
 
     def __len__(self) -> int:
@@ -299,7 +355,9 @@ class Rollouts:
         before = earlier_index(moments, stride)
         frames, earlier = np.empty((2, len(indices), FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
         for place, episode in enumerate(episodes):
-            self.frames.read(episode, [moments[place], before[place]], [frames[place], earlier[place]])
+            self.frames.read(
+                episode, [moments[place], before[place]], [frames[place], earlier[place]]
+            )
         return frames, earlier
 
     def split(self) -> tuple[np.ndarray, np.ndarray]:

@@ -46,7 +46,10 @@ if TYPE_CHECKING:
     import cma
 
 LOG = "evolution.json"
-REMEMBERED, RESTING = 20, 4  # generations from which a hard track may be driven again, and the last ones, which rest
+REMEMBERED, RESTING = (
+    20,
+    4,
+)  # generations from which a hard track may be driven again, and the last ones, which rest
 
 
 def evolve(
@@ -82,21 +85,38 @@ def evolve(
     kept = kept_generation(variant, folder, log)
     if watch and log["generations"]:
         watch(log["generations"])
-    if log["best"] and kept == log["best"]["generation"] and len(log["generations"]) >= settings.generations:
+    if (
+        log["best"]
+        and kept == log["best"]["generation"]
+        and len(log["generations"]) >= settings.generations
+    ):
         return False
     space = search_space(settings, world_model, folder)
-    with locked(folder), threadpool_limits(1), worker_processes(settings.processes, executor) as executor:
+    with (
+        locked(folder),
+        threadpool_limits(1),
+        worker_processes(settings.processes, executor) as executor,
+    ):
         strategy, means = resume(variant, settings, folder, log, world_model, space, kept)
         source = hand_out(executor, folder, variant)
         done = len(log["generations"])
-        progress = tqdm(range(done, settings.generations), f"evolve C ({variant})", settings.generations, initial=done)
+        progress = tqdm(
+            range(done, settings.generations),
+            f"evolve C ({variant})",
+            settings.generations,
+            initial=done,
+        )
         for _ in progress:
-            entry = run_generation(log["generations"], strategy, means, space, executor, source, variant, settings)
+            entry = run_generation(
+                log["generations"], strategy, means, space, executor, source, variant, settings
+            )
             log["generations"].append(entry)
             better = note_best(log)
             save_json(folder / LOG, log)
             if better:  # after the log: a controller that the log does not know would be a stranger
-                keep_controller(variant, folder, log, space.expand(averaged_mean(means, settings)), world_model)
+                keep_controller(
+                    variant, folder, log, space.expand(averaged_mean(means, settings)), world_model
+                )
             worst, average, best = fitness_curves([entry])[:, 0]
             progress.set_postfix_str(f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}")
             if watch:
@@ -150,10 +170,16 @@ def resume(
 
 @threadpool_limits.wrap(limits=1)
 def check_space(
-    folder: Path, settings: Settings, space: SearchSpace, generations: list[dict], means: list[np.ndarray]
+    folder: Path,
+    settings: Settings,
+    space: SearchSpace,
+    generations: list[dict],
+    means: list[np.ndarray],
 ) -> None:
     """Raise ValueError if the last validated C is not what this search space makes of the means up to it."""
-    last = max((number for number, entry in enumerate(generations, 1) if "validation" in entry), default=0)
+    last = max(
+        (number for number, entry in enumerate(generations, 1) if "validation" in entry), default=0
+    )
     if not last:
         return
     found = vector_checksum(space.expand(averaged_mean(means[:last], settings)))
@@ -181,7 +207,12 @@ def read_log(variant: str, settings: Settings, folder: Path, world_model: WorldM
     Raises:
         ValueError: it is damaged, was made with other settings, another V or another M, or is longer than asked for.
     """
-    new = {"variant": variant, "settings": settings.as_dict(), **world_model.identities, "best": None}
+    new = {
+        "variant": variant,
+        "settings": settings.as_dict(),
+        **world_model.identities,
+        "best": None,
+    }
     if not (folder / LOG).exists():
         return new | {"generations": []}
     log = load_json(folder / LOG, f"evolve C again, with {CONTROLLER} moved away, too")
@@ -223,15 +254,21 @@ def kept_generation(variant: str, folder: Path, log: dict) -> int | None:
 def note_best(log: dict) -> bool:
     """Note in the log after which generation the validation tracks were driven best; True if it is the last one."""
     last = log["generations"][-1]
-    if "validation" not in last or (log["best"] and last["validation"]["mean"] <= log["best"]["validation"]):
+    if "validation" not in last or (
+        log["best"] and last["validation"]["mean"] <= log["best"]["validation"]
+    ):
         return False
     log["best"] = {"generation": last["generation"], "validation": last["validation"]["mean"]}
     return True
 
 
-def keep_controller(variant: str, folder: Path, log: dict, controller: np.ndarray, world_model: WorldModel) -> None:
+def keep_controller(
+    variant: str, folder: Path, log: dict, controller: np.ndarray, world_model: WorldModel
+) -> None:
     """Write C, float64 (parameters,), with what it has to do with the log and with V and M."""
-    save_controller(folder / CONTROLLER, controller, variant=variant, **log["best"], **world_model.identities)
+    save_controller(
+        folder / CONTROLLER, controller, variant=variant, **log["best"], **world_model.identities
+    )
 
 
 def make_strategy(start: np.ndarray, settings: Settings) -> "cma.CMAEvolutionStrategy":
@@ -268,7 +305,9 @@ def ask(strategy: "cma.CMAEvolutionStrategy", settings: Settings, generation: in
     return np.array(strategy.ask())
 
 
-def tell(strategy: "cma.CMAEvolutionStrategy", population: np.ndarray, returns: list, means: list) -> None:
+def tell(
+    strategy: "cma.CMAEvolutionStrategy", population: np.ndarray, returns: list, means: list
+) -> None:
     """Tell CMA-ES, which minimises, what each agent of a population has returned on its tracks; adds to the means."""
     strategy.tell(population, [-np.mean(own) for own in returns])
     means.append(strategy.mean.copy())
@@ -333,7 +372,12 @@ def generation_tracks(settings: Settings, earlier: list[dict]) -> list[int]:
 
 
 def drive_generation(
-    executor: Executor, source: Any, variant: str, settings: Settings, earlier: list[dict], population: np.ndarray
+    executor: Executor,
+    source: Any,
+    variant: str,
+    settings: Settings,
+    earlier: list[dict],
+    population: np.ndarray,
 ) -> dict:
     """Let every agent drive the tracks of the generation after the `earlier` ones: the log's entry.
 
@@ -341,7 +385,9 @@ def drive_generation(
     """
     tracks = generation_tracks(settings, earlier)
     agents = np.repeat(population, len(tracks), axis=0)
-    returns, lengths = drive_parallel(executor, source, variant, agents, tracks * len(population), settings)
+    returns, lengths = drive_parallel(
+        executor, source, variant, agents, tracks * len(population), settings
+    )
     shape = (len(population), len(tracks))
     return {
         "generation": len(earlier) + 1,
@@ -351,14 +397,18 @@ def drive_generation(
     }
 
 
-def validate(executor: Executor, source: Any, variant: str, settings: Settings, controller: np.ndarray) -> dict:
+def validate(
+    executor: Executor, source: Any, variant: str, settings: Settings, controller: np.ndarray
+) -> dict:
     """Drive a controller, float64 (parameters,), on the validation tracks.
 
     Returns its mean return, all returns, the frames, and which one it was.
     """
     tracks = track_seeds("validate", settings.validation_tracks)  # the same ones for every seed
     copies = np.repeat(controller[None], len(tracks), axis=0)
-    patient = dataclasses.replace(settings, patience=0)  # nobody is given up on, as in the final evaluation
+    patient = dataclasses.replace(
+        settings, patience=0
+    )  # nobody is given up on, as in the final evaluation
     returns, lengths = drive_parallel(executor, source, variant, copies, tracks, patient)
     return {
         "mean": float(returns.mean()),
@@ -369,7 +419,12 @@ def validate(executor: Executor, source: Any, variant: str, settings: Settings, 
 
 
 def drive_parallel(
-    executor: Executor, source: Any, variant: str, parameters: np.ndarray, tracks: list[int], settings: Settings
+    executor: Executor,
+    source: Any,
+    variant: str,
+    parameters: np.ndarray,
+    tracks: list[int],
+    settings: Settings,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode for each row of `parameters` (episodes, parameters): (returns, lengths in frames).
 
@@ -379,8 +434,13 @@ def drive_parallel(
     """
     size = min(settings.cars, math.ceil(len(tracks) / 2))
     groups = [slice(start, start + size) for start in range(0, len(tracks), size)]
-    tasks = [(source, variant, parameters[group], tracks[group], True, settings) for group in groups]
-    return tuple(np.concatenate(part) for part in zip(*run_in_order(executor, drive_group, tasks), strict=True))
+    tasks = [
+        (source, variant, parameters[group], tracks[group], True, settings) for group in groups
+    ]
+    return tuple(
+        np.concatenate(part)
+        for part in zip(*run_in_order(executor, drive_group, tasks), strict=True)
+    )
 
 
 def drive_group(

@@ -19,7 +19,13 @@ from stad_lab.io.workers import refuse_in_starting_worker
 from stad_lab.models.mdn_rnn import check_partner
 from stad_lab.models.vae import check_variant
 from stad_lab.training.evolution import evolve
-from stad_lab.training.pipeline import GIVE_A_RUN, open_record, read_finished, run_stages, set_options
+from stad_lab.training.pipeline import (
+    GIVE_A_RUN,
+    open_record,
+    read_finished,
+    run_stages,
+    set_options,
+)
 from stad_lab.training.subspace import COMPONENTS, START, load_directions, load_start, save_start
 
 FINISH = {  # what it changes in the settings of the run that it goes on from
@@ -43,12 +49,18 @@ def finish_settings(earlier: str | Path, /, **changes) -> Settings:
     """
     record = load_json(Path(earlier) / "record.json", GIVE_A_RUN)
     if "settings" not in record:
-        raise ValueError(f"{earlier} is of {record['variant']}, which has no C to go on from: {GIVE_A_RUN}")
+        raise ValueError(
+            f"{earlier} is of {record['variant']}, which has no C to go on from: {GIVE_A_RUN}"
+        )
     return Settings.from_dict(record["settings"] | FINISH | changes)
 
 
 def finish(
-    variant: str, settings: Settings, earlier: str | Path, folder: str | Path, executor: Executor | None = None
+    variant: str,
+    settings: Settings,
+    earlier: str | Path,
+    folder: str | Path,
+    executor: Executor | None = None,
 ) -> bool:
     """Search on from the C of the run in `earlier`; run it again after an interrupt to go on.
 
@@ -72,7 +84,9 @@ def finish(
     earlier, folder = Path(earlier), Path(folder)
     before = check_earlier(variant, settings, earlier)
     stages = {
-        "controller": lambda pool: begin_finish(variant, earlier, folder) | evolve(variant, settings, folder, pool)
+        "controller": lambda pool: (
+            begin_finish(variant, earlier, folder) | evolve(variant, settings, folder, pool)
+        )
     }
     command = f"python -m stad_lab finish --variant {variant} --path ... --out ..."
     command += set_options(settings, finish_settings(earlier))

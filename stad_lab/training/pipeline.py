@@ -36,12 +36,26 @@ from stad_lab.models.mdn_rnn import train_mdn_rnn
 from stad_lab.models.vae import check_variant, load_autoencoder, train_autoencoder
 from stad_lab.training.dataset import COLLECT_SETTINGS, MANIFEST, collect_rollouts
 from stad_lab.training.evolution import LOG, evolve
-from stad_lab.training.second_iteration import carry_over, check_earlier_agent, collect_again, order_of_episodes
+from stad_lab.training.second_iteration import (
+    carry_over,
+    check_earlier_agent,
+    collect_again,
+    order_of_episodes,
+)
 from stad_lab.training.subspace import COMPONENTS, START, find_components
 from stad_lab.training.trainer import training_device
 
 STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
-PACKAGES = ("torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless", "safetensors")
+PACKAGES = (
+    "torch",
+    "numpy",
+    "gymnasium",
+    "box2d",
+    "pygame-ce",
+    "cma",
+    "opencv-python-headless",
+    "safetensors",
+)
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
 WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, COMPONENTS, CONTROLLER)
 GIVE_A_RUN = "give the folder of a run, as `python -m stad_lab train --out` makes it"
@@ -98,7 +112,8 @@ def train(
         "autoencoder": lambda _: train_autoencoder(variant, settings, rollouts_folder, folder),
         "mdn_rnn": lambda _: train_mdn_rnn(variant, settings, rollouts_folder, folder),
         "controller": lambda pool: (
-            find_components(variant, settings, rollouts_folder, folder) | evolve(variant, settings, folder, pool)
+            find_components(variant, settings, rollouts_folder, folder)
+            | evolve(variant, settings, folder, pool)
         ),
     }
     if earlier is not None:
@@ -108,7 +123,9 @@ def train(
         stages["controller"] = lambda pool: carry_over(*again, folder) | search(pool)
     with locked(folder):
         record = open_record(folder, variant, settings, command_of(variant, settings), before)
-        return run_stages(stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder, executor)
+        return run_stages(
+            stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder, executor
+        )
 
 
 def run_stages(
@@ -131,13 +148,17 @@ def run_stages(
             raise
         finally:
             if did:
-                record["seconds"][stage] = record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
+                record["seconds"][stage] = (
+                    record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
+                )
                 record.setdefault("peak_memory", {}).setdefault(stage, []).append(peak_memory(pool))
                 save_json(folder / "record.json", record)
         print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
         worked |= did
     spent = budget(Settings.from_dict(record["settings"]), folder, rollouts_folder)
-    if worked or spent != record.get("budget"):  # a kill may have come between the last generation and this line
+    if worked or spent != record.get(
+        "budget"
+    ):  # a kill may have come between the last generation and this line
         record["budget"] = spent
         save_json(folder / "record.json", record)
     return worked
@@ -152,8 +173,14 @@ def read_finished(earlier: Path) -> dict:
     """
     record = load_json(earlier / "record.json", GIVE_A_RUN)
     log = load_json(earlier / LOG, GIVE_A_RUN)
-    done, asked = len(log["generations"]), log["settings"]["generations"]  # of a longer run the log knows first
-    if done != asked or record.get("budget", {}).get("agents") != asked * record["settings"]["population"]:
+    done, asked = (
+        len(log["generations"]),
+        log["settings"]["generations"],
+    )  # of a longer run the log knows first
+    if (
+        done != asked
+        or record.get("budget", {}).get("agents") != asked * record["settings"]["population"]
+    ):
         raise ValueError(
             f"the search in {earlier} is not at its end, with {done} of {asked} generations: run its own command to the"
             " end first"
@@ -161,7 +188,9 @@ def read_finished(earlier: Path) -> dict:
     return record
 
 
-def open_record(folder: Path, variant: str, settings: Settings, command: str, before: dict | None = None) -> dict:
+def open_record(
+    folder: Path, variant: str, settings: Settings, command: str, before: dict | None = None
+) -> dict:
     """The record of the run in `folder`, or a new one.
 
     Args:
@@ -187,9 +216,13 @@ def open_record(folder: Path, variant: str, settings: Settings, command: str, be
         return record
     record = load_json(path)
     if "settings" not in record:
-        raise ValueError(f"{folder} holds the record of {record['variant']}, which is no run: choose another folder")
+        raise ValueError(
+            f"{folder} holds the record of {record['variant']}, which is no run: choose another folder"
+        )
     check_same_run(
-        path, {"variant": record["variant"], **record["settings"]}, {"variant": variant, **settings.as_dict()}
+        path,
+        {"variant": record["variant"], **record["settings"]},
+        {"variant": variant, **settings.as_dict()},
     )
     if what_counts(record.get("earlier")) != what_counts(before):
         raise ValueError(
@@ -216,7 +249,9 @@ def what_counts(record: dict | None) -> dict | None:
     settings = Settings.from_dict(record["settings"]).as_dict()
     return {
         "variant": record["variant"],
-        "settings": {name: value for name, value in settings.items() if name not in ("name", "processes")},
+        "settings": {
+            name: value for name, value in settings.items() if name not in ("name", "processes")
+        },
         "budget": record.get("budget"),
         "earlier": what_counts(record.get("earlier")),
     }
@@ -237,7 +272,9 @@ def command_of(variant: str, settings: Settings) -> str:
 def set_options(settings: Settings, usual: Settings) -> str:
     """What a command line says to have these settings instead of the usual ones: " --set NAME=VALUE" of each change."""
     before = usual.as_dict()
-    changed = [f"{name}={value}" for name, value in settings.as_dict().items() if value != before[name]]
+    changed = [
+        f"{name}={value}" for name, value in settings.as_dict().items() if value != before[name]
+    ]
     return "".join(f" --set {shlex.quote(change)}" for change in changed)
 
 
@@ -264,7 +301,9 @@ def processor() -> str:
     On another one the last bits of a sum may differ, and with them a whole drive.
     """
     listed = Path("/proc/cpuinfo")
-    name = listed.read_text().partition("model name")[2].partition("\n")[0] if listed.exists() else ""
+    name = (
+        listed.read_text().partition("model name")[2].partition("\n")[0] if listed.exists() else ""
+    )
     return f"{name.strip(chr(9) + ' :') or platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
 
 
@@ -277,7 +316,10 @@ def git(*arguments: str) -> str | None:
     try:
         for command in (["ls-files", "--error-unmatch", here.name], arguments):
             found = subprocess.run(
-                ["git", "-C", str(here.parent), *command], capture_output=True, text=True, check=True
+                ["git", "-C", str(here.parent), *command],
+                capture_output=True,
+                text=True,
+                check=True,
             )
         return found.stdout.strip()
     except (OSError, subprocess.CalledProcessError):
@@ -322,9 +364,14 @@ def total_budget(record: dict) -> dict:
     total["agents"] = record["budget"].get("agents", 0)
     if "earlier" in record:
         before = total_budget(record["earlier"])
-        again = all(record["settings"][field] == record["earlier"]["settings"][field] for field in COLLECT_SETTINGS)
+        again = all(
+            record["settings"][field] == record["earlier"]["settings"][field]
+            for field in COLLECT_SETTINGS
+        )
         made_again = record["budget"]["random"] if again else {}
-        total = {unit: count + before[unit] - made_again.get(unit, 0) for unit, count in total.items()}
+        total = {
+            unit: count + before[unit] - made_again.get(unit, 0) for unit, count in total.items()
+        }
     return total
 
 
@@ -345,9 +392,14 @@ def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
     if target.resolve() == folder.resolve():
         raise ValueError(f"{folder} is where agents are shipped to: give the folder of a run")
     shipped = [name for name in (*WEIGHTS, "record.json", LOG) if (folder / name).exists()]
-    read = {name: load_tensors(folder / name) for name in shipped if name in WEIGHTS}  # all, before any is written
+    read = {
+        name: load_tensors(folder / name) for name in shipped if name in WEIGHTS
+    }  # all, before any is written
     for name, (tensors, facts) in read.items():
-        small = {key: value.half() if value.dtype == torch.float32 else value for key, value in tensors.items()}
+        small = {
+            key: value.half() if value.dtype == torch.float32 else value
+            for key, value in tensors.items()
+        }
         save_tensors(target / name, small, **facts)
     for name in shipped:
         if name not in read:

@@ -16,7 +16,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stad_lab.agent import CONTROLLER, Agent, WorldModel, load_agent, load_controller, read_world_model
+from stad_lab.agent import (
+    CONTROLLER,
+    Agent,
+    WorldModel,
+    load_agent,
+    load_controller,
+    read_world_model,
+)
 from stad_lab.config import Settings
 from stad_lab.envs.car_racing import make_env
 from stad_lab.envs.frames import to_frame
@@ -24,7 +31,14 @@ from stad_lab.io.files import checksum
 from stad_lab.io.workers import work_alone, worker_processes
 from stad_lab.models.controller import seen_columns, unpack
 from stad_lab.models.mdn_rnn import ACTION_SIZE
-from stad_lab.training.dataset import AGENT_SETTINGS, COLLECT_SETTINGS, Rollouts, collect, drive_randomly, track_seeds
+from stad_lab.training.dataset import (
+    AGENT_SETTINGS,
+    COLLECT_SETTINGS,
+    Rollouts,
+    collect,
+    drive_randomly,
+    track_seeds,
+)
 from stad_lab.training.evolution import hand_out, make_agent
 from stad_lab.training.subspace import START, features, load_start, save_start, sizes
 
@@ -54,9 +68,15 @@ def collect_again(
     """
     parameters, _ = load_controller(earlier / CONTROLLER, variant)
     made_with = {field: getattr(settings, field) for field in (*COLLECT_SETTINGS, *AGENT_SETTINGS)}
-    made_with |= {"variant": variant, "controller_sha256": checksum((earlier / CONTROLLER).read_bytes())}
+    made_with |= {
+        "variant": variant,
+        "controller_sha256": checksum((earlier / CONTROLLER).read_bytes()),
+    }
     numbers = order_of_episodes(settings)
-    longest = [settings.episode_frames if number < settings.episodes else settings.max_frames for number in numbers]
+    longest = [
+        settings.episode_frames if number < settings.episodes else settings.max_frames
+        for number in numbers
+    ]
     with worker_processes(settings.processes, executor) as executor:
         source = hand_out(executor, earlier, variant)
         tasks = [(source, variant, parameters, settings, number) for number in numbers]
@@ -92,22 +112,34 @@ def drive_either(
     if number < settings.episodes:
         return drive_randomly(settings, number)
     work_alone()
-    return drive_noisily(make_agent(source, variant, parameters), settings, number - settings.episodes)
+    return drive_noisily(
+        make_agent(source, variant, parameters), settings, number - settings.episodes
+    )
 
 
 @torch.inference_mode()
-def drive_noisily(agent: Agent, settings: Settings, index: int) -> tuple[np.ndarray, np.ndarray, int]:
+def drive_noisily(
+    agent: Agent, settings: Settings, index: int
+) -> tuple[np.ndarray, np.ndarray, int]:
     """Let an agent drive with an unsteady hand: (frames uint8 (T, 64, 64, 3), actions float32 (T, 3), track seed).
 
     How unsteady it is differs from episode to episode. M remembers what was done, not what was meant.
     """
     rng = np.random.default_rng([settings.seed, 5, index])
     track = track_seeds("collect", settings.agent_episodes, settings.seed, 1)[index]
-    unsteadiness, noise, waiting, frames, actions = rng.uniform(0, 2 * NOISE), np.zeros(2), 0, [], []
+    unsteadiness, noise, waiting, frames, actions = (
+        rng.uniform(0, 2 * NOISE),
+        np.zeros(2),
+        0,
+        [],
+        [],
+    )
     env = make_env(fast=True, bar=not settings.crop_bar)
     observation, _ = env.reset(seed=track)
     agent.reset()
-    while len(frames) < settings.max_frames and not (settings.patience and waiting >= settings.patience):
+    while len(frames) < settings.max_frames and not (
+        settings.patience and waiting >= settings.patience
+    ):
         before, action = agent.state, agent.act(observation)
         noise = 0.9 * noise + unsteadiness * rng.standard_normal(2)
         action[:2] = np.clip(action[:2] + noise, [-1, 0], 1)
@@ -122,7 +154,9 @@ def drive_noisily(agent: Agent, settings: Settings, index: int) -> tuple[np.ndar
     return np.array(frames), np.array(actions), track
 
 
-def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder: Path, folder: Path) -> bool:
+def carry_over(
+    variant: str, settings: Settings, earlier: Path, rollouts_folder: Path, folder: Path
+) -> bool:
     """Find the C that does with the new V and M, in `folder`, what the earlier C does; writes `start.safetensors`.
 
     Returns:
@@ -144,7 +178,9 @@ def carry_over(variant: str, settings: Settings, earlier: Path, rollouts_folder:
             wanted.append(outputs(parameters, features(old, frames, actions)))
             seen.append(features(new, frames, actions))
     columns = seen_columns(settings.features, *sizes(new))
-    start = fit_controller(np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT), columns)
+    start = fit_controller(
+        np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT), columns
+    )
     save_start(path, start, variant, new)
     return True
 

@@ -19,7 +19,12 @@ from stad_lab.agent import WorldModel, read_world_model
 from stad_lab.config import Settings
 from stad_lab.evaluation.trajectories import remember_drive
 from stad_lab.io.files import load_tensors, save_tensors
-from stad_lab.models.controller import check_parameters, initial_parameters, parameter_count, seen_columns
+from stad_lab.models.controller import (
+    check_parameters,
+    initial_parameters,
+    parameter_count,
+    seen_columns,
+)
 from stad_lab.models.mdn_rnn import ACTION_SIZE, check_partner, encode_frames
 from stad_lab.models.vae import check_part
 from stad_lab.training.dataset import Rollouts
@@ -58,13 +63,18 @@ def search_space(settings: Settings, world_model: WorldModel, folder: Path) -> S
             and M.
     """
     start = initial_parameters(*sizes(world_model), settings.initial_gas)
-    if settings.agent_episodes or (folder / START).exists():  # a finish may follow a run of one round
+    if (
+        settings.agent_episodes or (folder / START).exists()
+    ):  # a finish may follow a run of one round
         start = load_start(folder / START, world_model)
     if settings.components:
         directions = load_directions(folder / COMPONENTS, world_model)
         return SearchSpace(np.zeros(len(directions)), start, directions)
     seen = np.concatenate(
-        [np.tile(seen_columns(settings.features, *sizes(world_model)), ACTION_SIZE), np.ones(ACTION_SIZE, bool)]
+        [
+            np.tile(seen_columns(settings.features, *sizes(world_model)), ACTION_SIZE),
+            np.ones(ACTION_SIZE, bool),
+        ]
     )
     return SearchSpace(start[seen], np.zeros(len(start)), np.eye(len(start))[seen])
 
@@ -118,7 +128,9 @@ def features(world_model: WorldModel, frames: np.ndarray, actions: np.ndarray) -
     return np.concatenate([latents, remember_drive(world_model.mdn_rnn, latents, actions)], axis=1)
 
 
-def principal_components(seen: Iterable[np.ndarray], columns: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+def principal_components(
+    seen: Iterable[np.ndarray], columns: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The mean of what is seen, and the directions of its largest variance.
 
     They are not scaled to equal variance: a direction in which little happens is of little use to C, and equal steps
@@ -135,7 +147,11 @@ def principal_components(seen: Iterable[np.ndarray], columns: np.ndarray, count:
     frames, total, squares = 0, np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
     for episode in seen:
         episode = episode.astype(np.float64)
-        frames, total, squares = frames + len(episode), total + episode.sum(axis=0), squares + episode.T @ episode
+        frames, total, squares = (
+            frames + len(episode),
+            total + episode.sum(axis=0),
+            squares + episode.T @ episode,
+        )
     middle = total / frames
     covariance = squares / frames - np.outer(middle, middle)
     _, vectors = np.linalg.eigh(covariance[columns][:, columns])

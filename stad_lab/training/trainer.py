@@ -30,7 +30,10 @@ def training_device() -> torch.device:
         try:
             torch.ones(1, device="cuda").add_(1).item()
             return torch.device("cuda")
-        except (RuntimeError, AssertionError) as error:  # too old for this PyTorch, or others have taken all of it
+        except (
+            RuntimeError,
+            AssertionError,
+        ) as error:  # too old for this PyTorch, or others have taken all of it
             print(f"the GPU cannot be used, so V and M train on the CPU: {error}", file=sys.stderr)
     return torch.device("cpu")
 
@@ -69,7 +72,9 @@ def fit(
         OSError: the checkpoint cannot be written; the one before it is whole.
     """
     keep_freed_memory()
-    optimizer = torch.optim.Adam(model.parameters(), lr=learning_rate, fused=True)  # one pass over the weights, not ten
+    optimizer = torch.optim.Adam(
+        model.parameters(), lr=learning_rate, fused=True
+    )  # one pass over the weights, not ten
     history = load_state(checkpoint, model, optimizer, identity) if checkpoint.exists() else []
     start, sums = history[-1]["step"] if history else 0, {}
     every = max(1, steps // ENTRIES)
@@ -77,19 +82,28 @@ def fit(
     try:
         if watch and history:
             watch(history)
-        progress = tqdm(read_ahead(batch, range(start, steps)), label, steps, initial=start, unit="step")
+        progress = tqdm(
+            read_ahead(batch, range(start, steps)), label, steps, initial=start, unit="step"
+        )
         for step, present in progress:
             found = losses(*present)
             values = {name: loss.item() for name, loss in found.items()}
             check_loss(values["total"], label, step)
-            update(model, optimizer, found["total"], learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps)))
+            update(
+                model,
+                optimizer,
+                found["total"],
+                learning_rate * (0.55 + 0.45 * math.cos(math.pi * step / steps)),
+            )
             for name, value in values.items():
                 sums[name] = sums.get(name, 0.0) + value
             if (step + 1) % every == 0 or step + 1 == steps:
                 count = step + 1 - (history[-1]["step"] if history else 0)
                 means = {name: total / count for name, total in sums.items()}
                 heldout = heldout_losses()
-                check_loss(heldout["total"], label, step)  # after the last update no other would tell
+                check_loss(
+                    heldout["total"], label, step
+                )  # after the last update no other would tell
                 history.append({"step": step + 1, "train": means, "heldout": heldout})
                 sums = {}
                 progress.set_postfix(heldout=f"{heldout['total']:.4g}")
@@ -98,7 +112,9 @@ def fit(
                     watch(history)
     except KeyboardInterrupt:
         # The interrupt may have come in mid-update; the checkpoint of the last record is whole, so it stays.
-        print(f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint")
+        print(
+            f"{label}: interrupted in step {step}; run the same again to go on from the last checkpoint"
+        )
         raise
     return history
 
@@ -111,7 +127,9 @@ def check_loss(total: float, label: str, step: int) -> None:
         )
 
 
-def update(model: torch.nn.Module, optimizer: torch.optim.Optimizer, total: torch.Tensor, rate: float) -> None:
+def update(
+    model: torch.nn.Module, optimizer: torch.optim.Optimizer, total: torch.Tensor, rate: float
+) -> None:
     """One step of Adam against the gradient of `total`, which is shortened to a norm of 100."""
     for group in optimizer.param_groups:
         group["lr"] = rate
@@ -127,12 +145,19 @@ def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[in
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(batch, steps.start) if steps else None
         for step in steps:
-            present, following = following, reader.submit(batch, step + 1) if step + 1 < steps.stop else None
+            present, following = (
+                following,
+                reader.submit(batch, step + 1) if step + 1 < steps.stop else None,
+            )
             yield step, present.result()
 
 
 def save_state(
-    path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, history: list, identity: dict
+    path: Path,
+    model: torch.nn.Module,
+    optimizer: torch.optim.Optimizer,
+    history: list,
+    identity: dict,
 ) -> None:
     """Write everything the next step depends on: weights, Adam's moments, and the history, which says where we are."""
     tensors = {f"model.{name}": tensor for name, tensor in model.state_dict().items()}
@@ -141,13 +166,17 @@ def save_state(
     save_tensors(path, tensors, history=history, identity=identity)
 
 
-def load_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, identity: dict) -> list:
+def load_state(
+    path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimizer, identity: dict
+) -> list:
     """Restore what `save_state` wrote into `model` and `optimizer`; returns the history.
 
     Raises:
         ValueError: the file is damaged, or of a training of another identity.
     """
-    tensors, facts = load_tensors(path, "run the same command again, which trains this part from its start")
+    tensors, facts = load_tensors(
+        path, "run the same command again, which trains this part from its start"
+    )
     check_same_run(path, facts["identity"], identity)
     weights = {name[6:]: tensor for name, tensor in tensors.items() if name.startswith("model.")}
     load_into(model, weights, path)
@@ -155,7 +184,9 @@ def load_state(path: Path, model: torch.nn.Module, optimizer: torch.optim.Optimi
     for name, tensor in tensors.items():
         if name.startswith("adam."):
             number, moment = int(name.split(".")[1]), name.split(".")[2]
-            if tensor.shape == parameters[number].shape:  # a moment, and it must lie in memory as its weights do
+            if (
+                tensor.shape == parameters[number].shape
+            ):  # a moment, and it must lie in memory as its weights do
                 tensor = torch.empty_like(parameters[number]).copy_(tensor)
             state["state"].setdefault(number, {})[moment] = tensor
     optimizer.load_state_dict(state)

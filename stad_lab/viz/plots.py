@@ -19,22 +19,35 @@ from stad_lab.envs.car_racing import TRACK_WIDTH
 from stad_lab.evaluation.evaluate import SOLVED
 from stad_lab.evaluation.trajectories import MOTION, Drive, Inside
 
-BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
+BLUE, ORANGE, GREEN, RED, PURPLE, SKY = (
+    "#0072B2",
+    "#E69F00",
+    "#009E73",
+    "#D55E00",
+    "#CC79A7",
+    "#56B4E9",
+)
 COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
 DASHES = ("-", "--", "-.", ":")
 # Of lines: to colour-blind eyes GREEN and PURPLE are two greys, so they differ in more than colour.
-STYLES = tuple((color, DASHES[(place + turn) % 4]) for turn in range(4) for place, color in enumerate(COLORS))
+STYLES = tuple(
+    (color, DASHES[(place + turn) % 4]) for turn in range(4) for place, color in enumerate(COLORS)
+)
 MARKERS = "os^DvP"
 DIFFERENCE_MAP = "PuOr_r"
 
 
-def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **kwargs) -> tuple[Figure, np.ndarray]:
+def new_figure(
+    width: float, height: float, rows: int = 1, columns: int = 1, **kwargs
+) -> tuple[Figure, np.ndarray]:
     """An empty figure of so many inches, outside pyplot's global state: (Figure, its axes (rows, columns))."""
     figure = Figure(figsize=(width, height), layout="constrained", dpi=100)
     return figure, figure.subplots(rows, columns, squeeze=False, **kwargs)
 
 
-def plot_pictures(rows: list[list[np.ndarray | None]], columns: list[str], names: list[str], title: str) -> Figure:
+def plot_pictures(
+    rows: list[list[np.ndarray | None]], columns: list[str], names: list[str], title: str
+) -> Figure:
     """Pictures in a grid.
 
     Args:
@@ -43,8 +56,12 @@ def plot_pictures(rows: list[list[np.ndarray | None]], columns: list[str], names
         columns: titles of the columns.
         names: of the rows; "" for none.
     """
-    figure, axes = new_figure(1.7 * len(columns) + 0.8, 1.75 * len(rows) + 0.75, len(rows), len(columns))
-    differences = [p.mean(axis=-1) for row in rows for p in row if p is not None and p.dtype != np.uint8]
+    figure, axes = new_figure(
+        1.7 * len(columns) + 0.8, 1.75 * len(rows) + 0.75, len(rows), len(columns)
+    )
+    differences = [
+        p.mean(axis=-1) for row in rows for p in row if p is not None and p.dtype != np.uint8
+    ]
     limit = max([0.05, *(float(np.quantile(np.abs(d), 0.995)) for d in differences)])
     scale, drawn = Normalize(-limit, limit), None
     for row, name, row_axes in zip(rows, names, axes, strict=True):
@@ -56,14 +73,18 @@ def plot_pictures(rows: list[list[np.ndarray | None]], columns: list[str], names
             if picture.dtype == np.uint8:
                 axis.imshow(picture, interpolation="nearest")
             else:
-                drawn = axis.imshow(picture.mean(axis=-1), cmap=DIFFERENCE_MAP, norm=scale, interpolation="nearest")
+                drawn = axis.imshow(
+                    picture.mean(axis=-1), cmap=DIFFERENCE_MAP, norm=scale, interpolation="nearest"
+                )
         row_axes[0].set_ylabel(name, fontsize=9)
     for column, axis in zip(columns, axes[0], strict=True):
         axis.set_title(column, fontsize=9)
     if drawn is not None:
         figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label="difference d")
     figure.suptitle(title, fontsize=11)
-    figure.set_label(f"{title}. Rows: {', '.join(filter(None, names)) or 'one'}; columns: {', '.join(columns)}.")
+    figure.set_label(
+        f"{title}. Rows: {', '.join(filter(None, names)) or 'one'}; columns: {', '.join(columns)}."
+    )
     return figure
 
 
@@ -78,13 +99,20 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
     for (stride, values), color in zip(change.items(), itertools.cycle(COLORS), strict=False):
         correlation = np.corrcoef(speed, values)[0, 1]
         axis.scatter(
-            speed, values, s=8, color=color, alpha=0.6, label=f"stride {stride}: correlation {correlation:.2f}"
+            speed,
+            values,
+            s=8,
+            color=color,
+            alpha=0.6,
+            label=f"stride {stride}: correlation {correlation:.2f}",
         )
     axis.set(xlabel="true speed (world units per second)", ylabel="mean |d| of the frame")
     axis.legend(frameon=False)
     title = "The difference image grows with speed, and with the stride"
     axis.set_title(title, fontsize=11)
-    figure.set_label(f"{title}: one point for every ride and stride; strides {', '.join(map(str, change))}.")
+    figure.set_label(
+        f"{title}: one point for every ride and stride; strides {', '.join(map(str, change))}."
+    )
     return figure
 
 
@@ -93,7 +121,14 @@ def plot_history(history: list[dict], title: str, unit: str) -> Figure:
     figure, ((axis,),) = new_figure(6.5, 3.2)
     steps = [entry["step"] for entry in history]
     for kind, color, style in (("train", BLUE, "-"), ("heldout", ORANGE, "--")):
-        axis.plot(steps, [entry[kind]["total"] for entry in history], style, color=color, label=kind, marker=".")
+        axis.plot(
+            steps,
+            [entry[kind]["total"] for entry in history],
+            style,
+            color=color,
+            label=kind,
+            marker=".",
+        )
     axis.set(xlabel="training step", ylabel=f"loss ({unit})")
     axis.legend(frameon=False)
     axis.set_title(title, fontsize=11)
@@ -108,19 +143,27 @@ def plot_history(history: list[dict], title: str, unit: str) -> Figure:
 def plot_bars(values: dict[str, np.ndarray], title: str, xlabel: str, ylabel: str) -> Figure:
     """Sorted values, one panel for each name, on one scale: for example the KL of every latent dimension."""
     figure, axes = new_figure(2.1 * len(values) + 0.6, 2.7, 1, len(values), sharey=True)
-    for (name, array), axis, color in zip(values.items(), axes[0], itertools.cycle(COLORS), strict=False):
+    for (name, array), axis, color in zip(
+        values.items(), axes[0], itertools.cycle(COLORS), strict=False
+    ):
         axis.bar(np.arange(len(array)), np.sort(array)[::-1], color=color, width=0.9)
         axis.set_title(name, fontsize=9)
         axis.set_xlabel(xlabel, fontsize=9)
     axes[0, 0].set_ylabel(ylabel)
     figure.suptitle(title, fontsize=11)
-    told = ", ".join(f"{name} from {max(array):.3g} to {min(array):.3g}" for name, array in values.items())
+    told = ", ".join(
+        f"{name} from {max(array):.3g} to {min(array):.3g}" for name, array in values.items()
+    )
     figure.set_label(f"{title}. Bars sorted from high to low: {told}.")
     return figure
 
 
 def plot_mixture(
-    logpi: np.ndarray, mean: np.ndarray, logsigma: np.ndarray, temperatures: list[float], actual: float | None = None
+    logpi: np.ndarray,
+    mean: np.ndarray,
+    logsigma: np.ndarray,
+    temperatures: list[float],
+    actual: float | None = None,
 ) -> Figure:
     """The density of one latent dimension that a mixture (each array (mixtures,)) stands for, at some temperatures."""
     figure, ((axis,),) = new_figure(6.5, 3.4)
@@ -130,17 +173,27 @@ def plot_mixture(
         weights = np.exp((logpi - logpi.max()) / temperature)
         weights /= weights.sum()
         sigma = np.exp(logsigma) * np.sqrt(temperature)
-        parts = weights * np.exp(-0.5 * ((z[:, None] - mean) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-        axis.plot(z, parts.sum(axis=1), dash, color=color, lw=2, label=f"temperature {temperature:g}")
+        parts = (
+            weights
+            * np.exp(-0.5 * ((z[:, None] - mean) / sigma) ** 2)
+            / (sigma * np.sqrt(2 * np.pi))
+        )
+        axis.plot(
+            z, parts.sum(axis=1), dash, color=color, lw=2, label=f"temperature {temperature:g}"
+        )
         if len(temperatures) == 1:
             axis.plot(z, parts, color="grey", lw=0.8, ls=":")
     if actual is not None:
         axis.axvline(actual, color=RED, ls="--", lw=1.5, label="what came")
-    axis.set(xlabel="next value of the latent dimension", ylabel="probability density", ylim=(0, None))
+    axis.set(
+        xlabel="next value of the latent dimension", ylabel="probability density", ylim=(0, None)
+    )
     axis.legend(frameon=False)
     title = "What M expects of one latent dimension"
     axis.set_title(title, fontsize=11)
-    figure.set_label(f"{title}: density of the mixture at temperature {', '.join(f'{t:g}' for t in temperatures)}.")
+    figure.set_label(
+        f"{title}: density of the mixture at temperature {', '.join(f'{t:g}' for t in temperatures)}."
+    )
     return figure
 
 
@@ -163,14 +216,18 @@ def plot_curves(
     many = len(curves) > 4  # then the names stand beside the lines
     figure, ((axis,),) = new_figure(7.5 if many else 6.5, 3.2)
     shapes = itertools.cycle(MARKERS if many and marker else [marker])
-    for (name, values), (color, dash), shape in zip(curves.items(), itertools.cycle(STYLES), shapes, strict=False):
+    for (name, values), (color, dash), shape in zip(
+        curves.items(), itertools.cycle(STYLES), shapes, strict=False
+    ):
         places = np.arange(1, len(values) + 1) if x is None else x
         axis.plot(places, values, dash, color=color, label=name, marker=shape)
     axis.set(xlabel=xlabel, ylabel=ylabel, **axis_settings)
     beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5)} if many else {}
     axis.legend(frameon=False, fontsize=9, **beside)
     axis.set_title(title, fontsize=11)
-    told = ", ".join(f"{name} from {values[0]:.3g} to {values[-1]:.3g}" for name, values in curves.items())
+    told = ", ".join(
+        f"{name} from {values[0]:.3g} to {values[-1]:.3g}" for name, values in curves.items()
+    )
     figure.set_label(f"{title}. Lines: {told}.")
     return figure
 
@@ -192,7 +249,11 @@ def plot_intervals(
     lines = -(-len(panels) // columns)
     rows = list(next(iter(panels.values())))
     width = 2.0 + 2.5 * columns if columns > 1 else 6.5
-    names = list(dict.fromkeys(name for contenders in panels.values() for row in contenders.values() for name in row))
+    names = list(
+        dict.fromkeys(
+            name for contenders in panels.values() for row in contenders.values() for name in row
+        )
+    )
     height = max(0.32, 0.11 * len(names)) * len(rows) + 0.75  # of a panel, in inches
     figure, axes = new_figure(width, lines * height + 0.7, lines, columns, sharex=True, sharey=True)
     shifts = np.linspace(-0.2, 0.2, len(names)) if len(names) > 1 else [0]
@@ -203,7 +264,10 @@ def plot_intervals(
                     continue
                 value, interval = contenders[row][name]
                 outside = limits is not None and value < limits[0]
-                x, y = limits[0] if outside else value, place + (shift if len(contenders[row]) > 1 else 0)
+                x, y = (
+                    limits[0] if outside else value,
+                    place + (shift if len(contenders[row]) > 1 else 0),
+                )
                 axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.5)
                 axis.plot(x, y, "<" if outside else "o", color=color, ms=5, clip_on=not outside)
         axis.set(yticks=range(len(rows)), yticklabels=rows, ylim=(len(rows) - 0.5, -0.5))
@@ -215,9 +279,12 @@ def plot_intervals(
         axes[0, 0].set_xlim(limits)
     if len(names) > 1:
         handles = [
-            axes[0, 0].plot([], [], "o", color=c)[0] for _, c in zip(names, itertools.cycle(COLORS), strict=False)
+            axes[0, 0].plot([], [], "o", color=c)[0]
+            for _, c in zip(names, itertools.cycle(COLORS), strict=False)
         ]
-        figure.legend(handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9)
+        figure.legend(
+            handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9
+        )
     figure.suptitle(title, fontsize=11)
     count = sum(len(found) for contenders in panels.values() for found in contenders.values())
     told = names if count <= 40 else names[:1]  # more than that, nobody would listen to
@@ -237,14 +304,22 @@ def plot_claims(scores: dict[str, dict[str, tuple[float, list[float], list[float
 
     A dot is a mean, with its interval; a short line through it is one search. The second panel is a close-up.
     """
-    names = list(dict.fromkeys(name for found in scores.values() for name in found))  # a variant may lack some
-    figure, ((whole, close),) = new_figure(9.0, 3.4, 1, 2, sharey=True, gridspec_kw={"width_ratios": [3, 2]})
+    names = list(
+        dict.fromkeys(name for found in scores.values() for name in found)
+    )  # a variant may lack some
+    figure, ((whole, close),) = new_figure(
+        9.0, 3.4, 1, 2, sharey=True, gridspec_kw={"width_ratios": [3, 2]}
+    )
     for axis, (place, found) in itertools.product((whole, close), enumerate(scores.values())):
-        for name, color, shift in zip(names, COLORS, np.linspace(-0.27, 0.27, len(names)), strict=False):
+        for name, color, shift in zip(
+            names, COLORS, np.linspace(-0.27, 0.27, len(names)), strict=False
+        ):
             if name in found:
                 mean, interval, searches = found[name]
                 axis.plot(interval, [place + shift] * 2, color=color, lw=2, alpha=0.4)
-                axis.plot(searches, [place + shift] * len(searches), "|", color=color, ms=8, mew=1.5)
+                axis.plot(
+                    searches, [place + shift] * len(searches), "|", color=color, ms=8, mew=1.5
+                )
                 axis.plot(mean, place + shift, "o" if searches else "D", color=color, ms=5)
     whole.set(yticks=range(len(scores)), yticklabels=list(scores), ylim=(len(scores) - 0.5, -0.5))
     close.set_xlim(870, 930)
@@ -256,11 +331,16 @@ def plot_claims(scores: dict[str, dict[str, tuple[float, list[float], list[float
         whole.plot([], [], "D" if name == names[0] else "o", color=color)[0]
         for name, color in zip(names, COLORS, strict=False)
     ]
-    figure.legend(handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9)
-    title = "Claimed and found: mean return on 100 tracks, ours with its 95% interval and its searches"
+    figure.legend(
+        handles, names, loc="outside lower right", ncols=len(names), frameon=False, fontsize=9
+    )
+    title = (
+        "Claimed and found: mean return on 100 tracks, ours with its 95% interval and its searches"
+    )
     figure.suptitle(title, fontsize=11)
     told = [
-        f"{variant} {name} {mean:.0f}" + (f" (searches {', '.join(f'{own:.0f}' for own in searches)})" * bool(searches))
+        f"{variant} {name} {mean:.0f}"
+        + (f" (searches {', '.join(f'{own:.0f}' for own in searches)})" * bool(searches))
         for variant, found in scores.items()
         for name, (mean, _, searches) in found.items()
     ]
@@ -274,21 +354,31 @@ def plot_stacks(stacks: dict[str, dict[str, float]], title: str, xlabel: str) ->
     for place, parts in enumerate(stacks.values()):
         left = 0.0
         for (part, value), color in zip(parts.items(), itertools.cycle(COLORS), strict=False):
-            axis.barh(place, value, left=left, color=color, height=0.6, label=part if place == 0 else None)
+            axis.barh(
+                place, value, left=left, color=color, height=0.6, label=part if place == 0 else None
+            )
             left += value
         axis.text(left, place, f" {left:.0f}", va="center", fontsize=9)
-    axis.set(xlabel=xlabel, yticks=range(len(stacks)), yticklabels=list(stacks), ylim=(len(stacks) - 0.5, -0.5))
+    axis.set(
+        xlabel=xlabel,
+        yticks=range(len(stacks)),
+        yticklabels=list(stacks),
+        ylim=(len(stacks) - 0.5, -0.5),
+    )
     axis.margins(x=0.1)
     axis.legend(frameon=False, fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3)
     figure.suptitle(title, fontsize=11)
     told = "; ".join(
-        f"{name}: {', '.join(f'{part} {value:.0f}' for part, value in parts.items())}" for name, parts in stacks.items()
+        f"{name}: {', '.join(f'{part} {value:.0f}' for part, value in parts.items())}"
+        for name, parts in stacks.items()
     )
     figure.set_label(f"{title}. {told}.")
     return figure
 
 
-def plot_rate_distortion(rates: np.ndarray, errors: np.ndarray, names: list[str], title: str) -> Figure:
+def plot_rate_distortion(
+    rates: np.ndarray, errors: np.ndarray, names: list[str], title: str
+) -> Figure:
     """What a latent tells (rate, nats) against what the drawing misses (distortion): a named point for each V."""
     figure, ((axis,),) = new_figure(6.5, 3.4)
     axis.plot(rates, errors, "o-", color=BLUE)
@@ -298,7 +388,8 @@ def plot_rate_distortion(rates: np.ndarray, errors: np.ndarray, names: list[str]
     axis.margins(0.18)
     axis.set_title(title, fontsize=11)
     points = ", ".join(
-        f"{name} {rate:.0f} nats, {error:.0f}" for name, rate, error in zip(names, rates, errors, strict=True)
+        f"{name} {rate:.0f} nats, {error:.0f}"
+        for name, rate, error in zip(names, rates, errors, strict=True)
     )
     figure.set_label(f"{title}. Points: {points}.")
     return figure
@@ -314,14 +405,18 @@ def plot_shares(shares: dict[str, np.ndarray], title: str, xlabel: str) -> Figur
     axis.set(xlabel=xlabel, ylabel="density", ylim=(0, None))
     axis.legend(frameon=False, fontsize=9)
     axis.set_title(title, fontsize=11)
-    told = ", ".join(f"{name} {min(s) * len(s):.2g} to {max(s) * len(s):.2g}" for name, s in shares.items())
+    told = ", ".join(
+        f"{name} {min(s) * len(s):.2g} to {max(s) * len(s):.2g}" for name, s in shares.items()
+    )
     figure.set_label(f"{title}. Histograms against a uniform one, which is 1: {told}.")
     return figure
 
 
 def plot_map(points: np.ndarray, colors: dict[str, np.ndarray], title: str) -> Figure:
     """Points in the plane (n, 2), once for each name, coloured by that name's values (n,)."""
-    figure, axes = new_figure(3.3 * len(colors) + 0.4, 3.3, 1, len(colors), sharex=True, sharey=True)
+    figure, axes = new_figure(
+        3.3 * len(colors) + 0.4, 3.3, 1, len(colors), sharex=True, sharey=True
+    )
     for axis, (name, values) in zip(axes[0], colors.items(), strict=True):
         low, high = np.quantile(values, [0.02, 0.98])
         drawn = axis.scatter(*points.T, c=values, s=3, cmap="cividis", vmin=low, vmax=high)
@@ -334,9 +429,13 @@ def plot_map(points: np.ndarray, colors: dict[str, np.ndarray], title: str) -> F
     return figure
 
 
-def plot_fit(x: np.ndarray, y: np.ndarray, samples: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
+def plot_fit(
+    x: np.ndarray, y: np.ndarray, samples: dict[str, tuple[np.ndarray, np.ndarray]], title: str
+) -> Figure:
     """Data points, and beside them what models would draw in their place: name -> (x, y)."""
-    figure, axes = new_figure(2.5 * (1 + len(samples)) + 0.3, 2.9, 1, 1 + len(samples), sharex=True, sharey=True)
+    figure, axes = new_figure(
+        2.5 * (1 + len(samples)) + 0.3, 2.9, 1, 1 + len(samples), sharex=True, sharey=True
+    )
     for axis, (name, dots), color in zip(
         axes[0], {"data": (x, y), **samples}.items(), itertools.cycle(COLORS), strict=False
     ):
@@ -353,7 +452,10 @@ def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> F
     """Driven paths seen from above, a panel for each: name -> (points (T, 2), whether the hand drove, bool (T,))."""
     figure, axes = new_figure(max(3.4 * len(paths), 5.0), 3.9, 1, len(paths))
     for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
-        for driver, shown, color, size in (("agent", ~by_hand, BLUE, 4), ("hand", by_hand, ORANGE, 12)):
+        for driver, shown, color, size in (
+            ("agent", ~by_hand, BLUE, 4),
+            ("hand", by_hand, ORANGE, 12),
+        ):
             if shown.any():
                 axis.scatter(*points[shown].T, s=size, color=color, label=driver)
         axis.plot(*points[0], "^", color="black", ms=9, label="start")
@@ -363,12 +465,16 @@ def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> F
         axis.legend(frameon=False, fontsize=8)
     axes[0, 0].set_ylabel("world units, ahead of the start")
     figure.suptitle(title, fontsize=11)
-    ends = ", ".join(f"{name}: {len(hand)} frames, {hand.sum()} by hand" for name, (_, hand) in paths.items())
+    ends = ", ".join(
+        f"{name}: {len(hand)} frames, {hand.sum()} by hand" for name, (_, hand) in paths.items()
+    )
     figure.set_label(f"{title}. The way of the car from above. {ends}.")
     return figure
 
 
-def plot_road(road: np.ndarray, paths: dict[str, np.ndarray], title: str, center: int, reach: float) -> Figure:
+def plot_road(
+    road: np.ndarray, paths: dict[str, np.ndarray], title: str, center: int, reach: float
+) -> Figure:
     """A lap from above, and a part of it close up, with the ways that cars took.
 
     Args:
@@ -393,7 +499,9 @@ def plot_road(road: np.ndarray, paths: dict[str, np.ndarray], title: str, center
     axes[0, 1].legend(fontsize=8)
     figure.suptitle(title, fontsize=11)
     ways = f"the ways of {', '.join(paths)}"
-    figure.set_label(f"{title}. A lap of {len(road)} tiles from above, and close up around tile {center}: {ways}.")
+    figure.set_label(
+        f"{title}. A lap of {len(road)} tiles from above, and close up around tile {center}: {ways}."
+    )
     return figure
 
 
@@ -408,7 +516,9 @@ def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
         ValueError: a moment outside the drive.
     """
     if not 0 <= moment < len(drive):
-        raise ValueError(f"moment={moment}: expected 0 to {len(drive) - 1}, the drive has {len(drive)} frames")
+        raise ValueError(
+            f"moment={moment}: expected 0 to {len(drive) - 1}, the drive has {len(drive)} frames"
+        )
     figure = Figure(figsize=(9.5, 5.6), layout="constrained", dpi=100)
     above, middle, below = figure.subfigures(3, 1, height_ratios=[1.6, 1.25, 0.8])
     pictures = {
@@ -419,7 +529,9 @@ def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
     }
     if inside.drawn_differences is not None:
         pictures["V's difference"] = difference_colors(inside.drawn_differences[moment])
-    for (name, picture), axis in zip(pictures.items(), above.subplots(1, len(pictures)), strict=True):
+    for (name, picture), axis in zip(
+        pictures.items(), above.subplots(1, len(pictures)), strict=True
+    ):
         axis.imshow(picture, interpolation="nearest")
         axis.set(xticks=[], yticks=[])
         axis.set_title(name, fontsize=9)
@@ -441,15 +553,17 @@ def plot_moment(drive: Drive, inside: Inside, moment: int) -> Figure:
     reward.axvline(moment, color="black", lw=1)
     reward.set(xlabel="frame", ylabel="return so far", xlim=(0, len(drive) - 1))
     speed = drive.motion[moment, 0]
-    title = (
-        f"Frame {moment} of {len(drive)}: speed {speed:.0f} world units per second, reward {drive.rewards[moment]:+.1f}"
-    )
+    title = f"Frame {moment} of {len(drive)}: speed {speed:.0f} world units per second, reward {drive.rewards[moment]:+.1f}"
     figure.suptitle(title, fontsize=11)
-    figure.set_label(f"{title}. Observation, frame, difference, what V redraws, z, mixture weights, action, return.")
+    figure.set_label(
+        f"{title}. Observation, frame, difference, what V redraws, z, mixture weights, action, return."
+    )
     return figure
 
 
-def plot_search(landscape: Callable[[np.ndarray], np.ndarray], generations: list[dict], shown: list[int]) -> Figure:
+def plot_search(
+    landscape: Callable[[np.ndarray], np.ndarray], generations: list[dict], shown: list[int]
+) -> Figure:
     """CMA-ES on a function of two variables: the population and the one-sigma ellipse of some generations.
 
     Args:
@@ -464,11 +578,24 @@ def plot_search(landscape: Callable[[np.ndarray], np.ndarray], generations: list
     for index, axis in zip(shown, axes[0], strict=True):
         generation = generations[index]
         axis.contourf(x, x, np.log(height - height.min() + 1e-2), 18, cmap="Greys_r", alpha=0.8)
-        axis.scatter(*generation["population"].T, s=16, color=ORANGE, edgecolor="black", lw=0.4, zorder=3)
+        axis.scatter(
+            *generation["population"].T, s=16, color=ORANGE, edgecolor="black", lw=0.4, zorder=3
+        )
         values, vectors = np.linalg.eigh(generation["covariance"])
         tilt = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
         width, thickness = 2 * np.sqrt(values[1]), 2 * np.sqrt(values[0])
-        axis.add_patch(Ellipse(generation["mean"], width, thickness, angle=tilt, fill=False, ec=SKY, lw=2.5, zorder=4))
+        axis.add_patch(
+            Ellipse(
+                generation["mean"],
+                width,
+                thickness,
+                angle=tilt,
+                fill=False,
+                ec=SKY,
+                lw=2.5,
+                zorder=4,
+            )
+        )
         axis.plot(*generation["mean"], "+", color=RED, ms=10, mew=2, zorder=5)
         axis.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x", aspect="equal")
         axis.set_title(f"generation {index + 1}", fontsize=9)
@@ -488,13 +615,23 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
     """
     figure, ((axis,),) = new_figure(7.0, 3.8)
     generation = np.arange(1, curves.shape[1] + 1)
-    for values, name, color in zip(curves, ("worst", "average", "best"), (RED, BLUE, GREEN), strict=True):
+    for values, name, color in zip(
+        curves, ("worst", "average", "best"), (RED, BLUE, GREEN), strict=True
+    ):
         axis.plot(generation, values, color=color, lw=1.3, label=f"{name} agent of the generation")
     if validation:
-        axis.plot(*zip(*validation.items(), strict=True), "o--", color="black", ms=4, label="C, validation tracks")
+        axis.plot(
+            *zip(*validation.items(), strict=True),
+            "o--",
+            color="black",
+            ms=4,
+            label="C, validation tracks",
+        )
     axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
     axis.set(
-        xlabel="generation", ylabel="fitness: mean return over the tracks", ylim=(min(-60, curves.min() - 20), 1000)
+        xlabel="generation",
+        ylabel="fitness: mean return over the tracks",
+        ylim=(min(-60, curves.min() - 20), 1000),
     )
     axis.legend(frameon=False, fontsize=9)
     axis.set_title(title, fontsize=11)
@@ -515,27 +652,39 @@ def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figu
     """
     figure, axes = new_figure(11.0, 3.9, 1, 3, sharey=True)
     for panel, (axis, name) in enumerate(zip(axes[0], ("worst", "average", "best"), strict=True)):
-        for (label, curves), (color, dash) in zip(runs.items(), itertools.cycle(STYLES), strict=False):
+        for (label, curves), (color, dash) in zip(
+            runs.items(), itertools.cycle(STYLES), strict=False
+        ):
             width = min(window, curves.shape[2])
-            smooth = np.apply_along_axis(np.convolve, 1, curves[:, panel], np.full(width, 1 / width), "valid")
+            smooth = np.apply_along_axis(
+                np.convolve, 1, curves[:, panel], np.full(width, 1 / width), "valid"
+            )
             generation = np.arange(smooth.shape[1]) + (width + 1) / 2
             axis.plot(generation, smooth.mean(axis=0), dash, color=color, lw=1.6, label=label)
             axis.plot(generation, smooth.T, color=color, lw=0.7, alpha=0.5)
-            axis.fill_between(generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.1, lw=0)
+            axis.fill_between(
+                generation, smooth.min(axis=0), smooth.max(axis=0), color=color, alpha=0.1, lw=0
+            )
         axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
         axis.set_title(f"{name} agent of a generation", fontsize=10)
         axis.set_xlabel("generation")
     window = min([window, *(curves.shape[2] for curves in runs.values())])
     axes[0, 0].set_ylabel(f"fitness, mean of {window} generations")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False)
+    figure.legend(
+        *axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False
+    )
     figure.suptitle(title, fontsize=11)
     last = ", ".join(f"{name} {curves[:, 1, -window:].mean():.0f}" for name, curves in runs.items())
-    figure.set_label(f"{title}. Average agent of the last {window} generations, mean of the seeds: {last}.")
+    figure.set_label(
+        f"{title}. Average agent of the last {window} generations, mean of the seeds: {last}."
+    )
     return figure
 
 
 def plot_episodes(
-    runs: dict[str, list[tuple[np.ndarray, np.ndarray]]], published: dict[str, dict[int, float]], title: str
+    runs: dict[str, list[tuple[np.ndarray, np.ndarray]]],
+    published: dict[str, dict[int, float]],
+    title: str,
 ) -> Figure:
     """Score against the episodes that were driven for it, on a logarithmic axis: the fair comparison of recipes.
 
@@ -546,15 +695,36 @@ def plot_episodes(
     figure, ((axis,),) = new_figure(8.0, 4.2 + 0.08 * len(runs))
     for (name, seeds), (color, dash) in zip(runs.items(), itertools.cycle(STYLES), strict=False):
         for number, (episodes, scores) in enumerate(seeds):
-            axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8, label=name if number == 0 else None)
+            axis.plot(
+                episodes,
+                scores,
+                dash,
+                color=color,
+                lw=1.3,
+                alpha=0.8,
+                label=name if number == 0 else None,
+            )
     for (name, points), marker in zip(published.items(), MARKERS, strict=False):
         axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
     axis.axhline(SOLVED, color="grey", lw=0.8, ls=":")
-    axis.set(xscale="log", xlabel="episodes driven in all (logarithmic)", ylabel="score", ylim=(None, 960))
+    axis.set(
+        xscale="log",
+        xlabel="episodes driven in all (logarithmic)",
+        ylabel="score",
+        ylim=(None, 960),
+    )
     # Below the axis: inside it, many names would hide the points.
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=9)
+    figure.legend(
+        *axis.get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=3,
+        frameon=False,
+        fontsize=9,
+    )
     axis.set_title(title, fontsize=11)
-    last = ", ".join(f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}" for name, seeds in runs.items())
+    last = ", ".join(
+        f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}" for name, seeds in runs.items()
+    )
     figure.set_label(f"{title}. At the end, mean of the seeds: {last}.")
     return figure
 
@@ -563,13 +733,27 @@ def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
     """Every episode's return as a dot, one row for each name, with the mean as a bar."""
     figure, ((axis,),) = new_figure(7.0, 0.8 * len(returns) + 1.4)
     rng = np.random.default_rng(0)
-    for row, (values, color) in enumerate(zip(returns.values(), itertools.cycle(COLORS), strict=False)):
-        axis.scatter(values, row + rng.uniform(-0.22, 0.22, len(values)), s=12, color=color, alpha=0.6)
+    for row, (values, color) in enumerate(
+        zip(returns.values(), itertools.cycle(COLORS), strict=False)
+    ):
+        axis.scatter(
+            values, row + rng.uniform(-0.22, 0.22, len(values)), s=12, color=color, alpha=0.6
+        )
         axis.plot([values.mean()] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
-        axis.text(1.01, row, f"mean {values.mean():.0f}", transform=axis.get_yaxis_transform(), va="center", fontsize=9)
+        axis.text(
+            1.01,
+            row,
+            f"mean {values.mean():.0f}",
+            transform=axis.get_yaxis_transform(),
+            va="center",
+            fontsize=9,
+        )
     axis.axvline(SOLVED, color="grey", lw=0.8, ls=":")
     axis.set(
-        xlabel="return of an episode", yticks=range(len(returns)), yticklabels=list(returns), ylim=(len(returns), -1)
+        xlabel="return of an episode",
+        yticks=range(len(returns)),
+        yticklabels=list(returns),
+        ylim=(len(returns), -1),
     )
     axis.set_title(title, fontsize=11)
     means = ", ".join(f"{name} mean {values.mean():.0f}" for name, values in returns.items())
@@ -598,7 +782,9 @@ def moving_picture(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
     """
     lengths = {title: len(film) for title, film in columns.items()}
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
-        raise ValueError(f"films of lengths {lengths}: expected films of one length, at least one frame")
+        raise ValueError(
+            f"films of lengths {lengths}: expected films of one length, at least one frame"
+        )
     size, header, gap = 192, 20, 6  # pixels
     font = ImageFont.load_default(13)
     pages = []
@@ -608,14 +794,19 @@ def moving_picture(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
         for place, (title, picture) in enumerate(zip(columns, pictures, strict=True)):
             left = place * (size + gap)
             draw.text((left + size / 2, header / 2), title, fill="black", font=font, anchor="mm")
-            page.paste(Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST), (left, header))
+            page.paste(
+                Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST),
+                (left, header),
+            )
         pages.append(page)
     # One palette for the whole film, or colours would flicker; "maximum coverage" keeps rare ones, as the car's red.
     sample = np.concatenate([np.asarray(page) for page in pages[:: max(1, len(pages) // 8)]])
     palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE)
     pages = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pages]
     buffer = io.BytesIO()
-    pages[0].save(buffer, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
+    pages[0].save(
+        buffer, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0
+    )
     return buffer.getvalue()
 
 
@@ -633,7 +824,9 @@ def moving_figure(figures: Iterable[Figure], fps: float, kind: str = "gif") -> b
     if not pages:
         raise ValueError("no figures: expected at least one")
     buffer = io.BytesIO()
-    pages[0].save(buffer, kind, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
+    pages[0].save(
+        buffer, kind, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0
+    )
     return buffer.getvalue()
 
 

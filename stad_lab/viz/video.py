@@ -7,9 +7,21 @@ from tqdm.auto import tqdm
 from stad_lab.agent import Agent
 from stad_lab.envs.dream import dream_on
 from stad_lab.envs.frames import earlier_frames
-from stad_lab.evaluation.trajectories import FRAMES_A_SECOND, Drive, Inside, look_inside, record_drive
+from stad_lab.evaluation.trajectories import (
+    FRAMES_A_SECOND,
+    Drive,
+    Inside,
+    look_inside,
+    record_drive,
+)
 from stad_lab.models.vae import to_array, to_pictures, to_uint8
-from stad_lab.viz.plots import check_kind, difference_colors, moving_figure, moving_picture, plot_moment
+from stad_lab.viz.plots import (
+    check_kind,
+    difference_colors,
+    moving_figure,
+    moving_picture,
+    plot_moment,
+)
 
 EVERY = 3  # of so many frames one is shown; a film runs at the real speed
 NAP = 100  # frames of a dream, two seconds: long enough to see it leave the drive, short enough to compare
@@ -51,7 +63,9 @@ def naps(agent: Agent, drive: Drive, first: int, length: int = NAP) -> np.ndarra
     agent.reset()
     dreams = []
     for moment, observation in enumerate(drive.observations):
-        agent.act(observation)  # as it did in the drive: this gives the agent its memory of that moment back
+        agent.act(
+            observation
+        )  # as it did in the drive: this gives the agent its memory of that moment back
         if moment >= first and (moment - first) % length == 0:
             dreams.append(dream_on(agent, min(length, len(drive) - moment), seed=len(dreams))[0])
     return np.concatenate(dreams)
@@ -75,7 +89,9 @@ def film_viewer(agent: Agent, track: int, first: int, frames: int, kind: str = "
 def film_inside(drive: Drive, inside: Inside, first: int = 0, kind: str = "gif") -> bytes:
     """The rollout viewer as an animation, "gif" or "webp": one moment in EVERY, at the real speed."""
     moments = tqdm(range(first, len(drive), EVERY), "film", unit="picture")
-    return moving_figure((plot_moment(drive, inside, moment) for moment in moments), FRAMES_A_SECOND / EVERY, kind)
+    return moving_figure(
+        (plot_moment(drive, inside, moment) for moment in moments), FRAMES_A_SECOND / EVERY, kind
+    )
 
 
 def record_longer_drive(agent: Agent, track: int, first: int, frames: int) -> Drive:
@@ -85,5 +101,7 @@ def record_longer_drive(agent: Agent, track: int, first: int, frames: int) -> Dr
             raise ValueError(f"{name}={value}: expected at least {least}")
     drive = record_drive(agent, track, first + frames)
     if len(drive) <= first:
-        raise ValueError(f"first={first}, but on track {track} the episode ends after {len(drive)} frames")
+        raise ValueError(
+            f"first={first}, but on track {track} the episode ends after {len(drive)} frames"
+        )
     return drive

@@ -26,7 +26,9 @@ Watch = Callable[[list[dict]], None]  # what a training calls with its entries s
 
 def show(*figures: Figure) -> HTML:
     """Figures as pictures, one below the other, each with its alternative text (the figure's label)."""
-    return HTML("".join(show_picture(to_png(figure), "png", figure.get_label()).data for figure in figures))
+    return HTML(
+        "".join(show_picture(to_png(figure), "png", figure.get_label()).data for figure in figures)
+    )
 
 
 def show_film(gif: bytes, alt: str) -> HTML:
@@ -41,9 +43,13 @@ def show_picture(content: bytes, kind: str, alt: str) -> HTML:
         ValueError: no alternative text.
     """
     if not alt.strip():
-        raise ValueError(f"alt={alt!r}: expected words that stand for the picture; a figure has them from set_label")
+        raise ValueError(
+            f"alt={alt!r}: expected words that stand for the picture; a figure has them from set_label"
+        )
     data = base64.b64encode(content).decode()
-    return HTML(f'<img src="data:image/{kind};base64,{data}" alt="{html.escape(alt)}" style="background: white">')
+    return HTML(
+        f'<img src="data:image/{kind};base64,{data}" alt="{html.escape(alt)}" style="background: white">'
+    )
 
 
 def show_source(*things: Callable) -> HTML:
@@ -120,7 +126,9 @@ def slider(low: float, high: float, value: float, label: str) -> ipywidgets.Widg
 
 def view_drive(drive: Drive, inside: Inside) -> ipywidgets.VBox:
     """The rollout viewer: everything about one moment of a drive, on a time slider."""
-    return explore(functools.partial(plot_moment, drive, inside), moment=slider(0, len(drive) - 1, 0, "frame"))
+    return explore(
+        functools.partial(plot_moment, drive, inside), moment=slider(0, len(drive) - 1, 0, "frame")
+    )
 
 
 def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
@@ -136,7 +144,12 @@ def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
     reach = max(4, int(np.ceil(np.abs(z).max())))  # of a normal latent hardly any is beyond 4
     sliders = [
         ipywidgets.FloatSlider(
-            round(float(value), 2), min=-reach, max=reach, step=0.05, description=f"z[{number}]", readout_format=".1f"
+            round(float(value), 2),
+            min=-reach,
+            max=reach,
+            step=0.05,
+            description=f"z[{number}]",
+            readout_format=".1f",
         )
         for number, value in enumerate(z)
     ]
@@ -144,7 +157,9 @@ def explore_latents(autoencoder: AutoEncoder, z: np.ndarray) -> ipywidgets.VBox:
     def redraw(_change=None) -> None:
         drawn = draw_latents(autoencoder, [control.value for control in sliders])
         for picture, name, content in zip(pictures, names, drawn, strict=True):
-            picture.value = show_picture(content, "png", f"the {name} that V draws from these latents").data
+            picture.value = show_picture(
+                content, "png", f"the {name} that V draws from these latents"
+            ).data
 
     for control in sliders:
         control.layout.width = "230px"

@@ -23,13 +23,17 @@ def follow_road(env, speed=45):
     cos, sin = math.cos(car.hull.angle), math.sin(car.hull.angle)
     steering = math.atan2(cos * dx + sin * dy, cos * dy - sin * dx)
     moving = math.hypot(*car.hull.linearVelocity)
-    return np.array([np.clip(steering, -1, 1), 0.5 * (moving < speed), 0.3 * (moving > speed + 15)], np.float32)
+    return np.array(
+        [np.clip(steering, -1, 1), 0.5 * (moving < speed), 0.3 * (moving > speed + 15)], np.float32
+    )
 
 
 def leave_field(env):
     """Full gas, holding the heading of the start, over grass and off the field."""
     hull, start = env.unwrapped.car.hull, env.unwrapped.track[0][1]
-    return np.array([np.clip(3 * (hull.angle - start) + 0.5 * hull.angularVelocity, -1, 1), 1, 0], np.float32)
+    return np.array(
+        [np.clip(3 * (hull.angle - start) + 0.5 * hull.angularVelocity, -1, 1), 1, 0], np.float32
+    )
 
 
 def wild(env):
@@ -72,7 +76,10 @@ def assert_equal_to_the_last_bit(fast, official):
 
 def differences(fast, official, rows=slice(None)):
     """Mean absolute difference of each pair of pictures."""
-    return [np.abs(a[rows].astype(int) - b[rows].astype(int)).mean() for a, b in zip(fast, official, strict=True)]
+    return [
+        np.abs(a[rows].astype(int) - b[rows].astype(int)).mean()
+        for a, b in zip(fast, official, strict=True)
+    ]
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -154,7 +161,12 @@ def test_pictures_differ_by_less_than_one_level_after_place_car():
     fast, official = make_env(fast=True), make_env(fast=False)
     fast.reset(seed=24)
     official.reset(seed=24)
-    for tile, speed, turn, offset in [(40, 0, 0, 0), (90, 50, 0.3, 0.6), (180, 90, -1.2, -1.5), (250, 20, 3.0, 0.9)]:
+    for tile, speed, turn, offset in [
+        (40, 0, 0, 0),
+        (90, 50, 0.3, 0.6),
+        (180, 90, -1.2, -1.5),
+        (250, 20, 3.0, 0.9),
+    ]:
         pictures = [[place_car(env, tile, speed, turn, offset)] for env in (fast, official)]
         for _ in range(5):
             for env, seen in zip((fast, official), pictures, strict=True):
@@ -163,7 +175,10 @@ def test_pictures_differ_by_less_than_one_level_after_place_car():
 
 
 def test_pictures_differ_by_less_than_one_level_in_random_colours():
-    fast, official = make_env(fast=True, domain_randomize=True), make_env(fast=False, domain_randomize=True)
+    fast, official = (
+        make_env(fast=True, domain_randomize=True),
+        make_env(fast=False, domain_randomize=True),
+    )
     plain = make_env(fast=True).reset(seed=25)[0]
     for options in (None, {"randomize": True}):
         pictures = [[env.reset(seed=25, options=options)[0]] for env in (fast, official)]
@@ -201,7 +216,10 @@ def test_spaces_are_those_of_car_racing(fast):
 
 def test_without_the_bar_only_the_bar_is_missing():
     whole, cropped = make_env(), make_env(bar=False)
-    pictures = [[env.reset(seed=29)[0], *(env.step(STRAIGHT)[0] for _ in range(20))] for env in (whole, cropped)]
+    pictures = [
+        [env.reset(seed=29)[0], *(env.step(STRAIGHT)[0] for _ in range(20))]
+        for env in (whole, cropped)
+    ]
     for with_bar, without in zip(*pictures, strict=True):
         assert np.array_equal(with_bar[:BAR_TOP], without[:BAR_TOP])
         assert with_bar[BAR_TOP:].any()
@@ -301,5 +319,7 @@ def test_place_car_moves_the_car_sideways():
 def test_an_action_that_is_not_finite_is_refused():
     env = make_env()
     env.reset(seed=0)
-    with pytest.raises(ValueError, match=r"action \[.*nan.*\]: expected finite numbers, steering, gas and brake"):
+    with pytest.raises(
+        ValueError, match=r"action \[.*nan.*\]: expected finite numbers, steering, gas and brake"
+    ):
         env.step(np.array([0, np.nan, 0]))

@@ -41,7 +41,9 @@ def test_the_same_seed_gives_the_same_dream_and_another_seed_another_one(dream):
     assert np.array_equal(dream_along(dream, seed=1, **start), first)
     assert not np.isclose(other[1:], first[1:]).all(axis=1).any()
     assert np.isfinite(first).all()
-    assert not np.isclose(dream.reset(seed=1)[0], dream.reset(seed=2)[0]).all()  # nor do they begin alike
+    assert not np.isclose(
+        dream.reset(seed=1)[0], dream.reset(seed=2)[0]
+    ).all()  # nor do they begin alike
 
 
 def test_the_action_steers_the_dream(dream):
@@ -89,21 +91,30 @@ def test_a_dream_shows_the_memory_of_m(dream, agent):
 @pytest.mark.parametrize("action", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]]])
 def test_an_action_that_is_not_three_finite_numbers_is_refused(action, dream):
     dream.reset(seed=0)
-    with pytest.raises(ValueError, match=r"action \[.*\]: expected three finite numbers, steering, gas and brake"):
+    with pytest.raises(
+        ValueError, match=r"action \[.*\]: expected three finite numbers, steering, gas and brake"
+    ):
         dream.step(np.array(action, np.float32))
 
 
 def test_latents_that_do_not_fit_are_refused(dream):
-    with pytest.raises(ValueError, match=r"latents of shape \(5,\), 5 of them finite: expected \(32,\) finite numbers"):
+    with pytest.raises(
+        ValueError,
+        match=r"latents of shape \(5,\), 5 of them finite: expected \(32,\) finite numbers",
+    ):
         dream.reset(options={"latents": np.zeros(5)})
-    with pytest.raises(ValueError, match=r"\(32,\), 0 of them finite: expected \(32,\) finite numbers"):
+    with pytest.raises(
+        ValueError, match=r"\(32,\), 0 of them finite: expected \(32,\) finite numbers"
+    ):
         dream.reset(options={"latents": np.full(32, np.nan)})
 
 
 @pytest.mark.parametrize(("cars", "value"), [(3, 0.0), (1, np.nan)])
 def test_a_memory_that_does_not_fit_is_refused(cars, value, dream):
     state = (torch.full((1, cars, dream.mdn_rnn.hidden_size), value),) * 2
-    with pytest.raises(ValueError, match=rf"a memory of shape \(1, {cars}, .*: expected \(1, 1, .*, M's h and c"):
+    with pytest.raises(
+        ValueError, match=rf"a memory of shape \(1, {cars}, .*: expected \(1, 1, .*, M's h and c"
+    ):
         dream.reset(options={"state": state})
 
 
@@ -114,7 +125,9 @@ def test_a_temperature_that_is_no_positive_number_is_refused(temperature, agent)
 
 
 def test_another_render_mode_is_refused(agent):
-    with pytest.raises(ValueError, match="render_mode='human': a dream can be rendered as 'rgb_array' only"):
+    with pytest.raises(
+        ValueError, match="render_mode='human': a dream can be rendered as 'rgb_array' only"
+    ):
         DreamEnv(agent.autoencoder, agent.mdn_rnn, render_mode="human")
 
 
@@ -152,7 +165,9 @@ def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent,
         agent.act(observation)
     pictures, actions = dream_on(agent, 4, temperature=1e-6)
     state, mixture = agent.state, agent.mdn_rnn.mixture(agent.state[0])
-    for picture, action in zip(pictures, actions, strict=True):  # by hand, with the likeliest z of every step
+    for picture, action in zip(
+        pictures, actions, strict=True
+    ):  # by hand, with the likeliest z of every step
         z = mixture.mean.gather(-1, mixture.logpi.argmax(-1, keepdim=True))[0, 0, :, 0]
         drawn = agent.autoencoder.decode(z[None])[0][0].permute(1, 2, 0).numpy()
         assert np.abs(drawn - picture / 255).max() < 0.02
@@ -183,7 +198,9 @@ def test_an_agent_in_a_film_dreams_on_from_its_own_drive_and_is_woken_in_time(ag
 
 
 def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
-    with pytest.raises(ValueError, match="has not acted yet: let it drive a few real frames, then dream on"):
+    with pytest.raises(
+        ValueError, match="has not acted yet: let it drive a few real frames, then dream on"
+    ):
         dream_on(agent, 5)
 
 
@@ -196,7 +213,10 @@ def test_a_dream_of_no_frame_is_refused(agent, observations):
 
 def test_one_car_dreams_on_with_its_own_c_and_several_cannot(agent, observations):
     rows = np.stack([agent.parameters, -agent.parameters])
-    many, alone = (Agent(agent.autoencoder, agent.mdn_rnn, c, agent.stride, agent.crop_bar) for c in (rows, rows[1]))
+    many, alone = (
+        Agent(agent.autoencoder, agent.mdn_rnn, c, agent.stride, agent.crop_bar)
+        for c in (rows, rows[1])
+    )
     many.act_batch(observations[:2])
     with pytest.raises(ValueError, match=r"drives 2 cars: expected one, so go on with agent\.keep"):
         dream_on(many, 5)

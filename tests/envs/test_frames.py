@@ -27,12 +27,15 @@ def test_a_frame_is_64_by_64_and_leaves_the_bar_out(observations):
     other_bar = observations[40].copy()
     other_bar[BAR_TOP:] = 255
     assert np.array_equal(to_frame(other_bar), frame)
-    assert not np.array_equal(to_frame(other_bar, crop_bar=False), to_frame(observations[40], crop_bar=False))
+    assert not np.array_equal(
+        to_frame(other_bar, crop_bar=False), to_frame(observations[40], crop_bar=False)
+    )
 
 
 def test_a_frame_shows_all_that_is_above_the_bar(observations):
     assert np.array_equal(
-        to_frame(observations[40]), cv2.resize(observations[40][:84], (64, 64), interpolation=cv2.INTER_AREA)
+        to_frame(observations[40]),
+        cv2.resize(observations[40][:84], (64, 64), interpolation=cv2.INTER_AREA),
     )
     for row, column in [(0, 0), (0, 95), (BAR_TOP - 1, 0), (BAR_TOP - 1, 95)]:
         changed = observations[40].copy()
@@ -42,7 +45,9 @@ def test_a_frame_shows_all_that_is_above_the_bar(observations):
 
 @pytest.mark.parametrize("crop_bar", [True, False])
 def test_a_plain_colour_stays_that_colour(crop_bar):
-    assert (to_frame(np.full((96, 96, 3), (10, 200, 30), np.uint8), crop_bar) == (10, 200, 30)).all()
+    assert (
+        to_frame(np.full((96, 96, 3), (10, 200, 30), np.uint8), crop_bar) == (10, 200, 30)
+    ).all()
 
 
 def test_a_difference_image_is_the_change_between_minus_one_and_one():
@@ -67,7 +72,10 @@ def test_differences_are_zero_until_stride_frames_exist(stride):
 
 @pytest.mark.parametrize("stride", [0, -1])
 def test_a_stride_that_looks_at_the_present_or_the_future_is_refused(stride):
-    for use in (FrameMemory, lambda stride: earlier_frames(np.zeros((9, 2, 2, 3), np.uint8), stride)):
+    for use in (
+        FrameMemory,
+        lambda stride: earlier_frames(np.zeros((9, 2, 2, 3), np.uint8), stride),
+    ):
         with pytest.raises(ValueError, match=f"stride={stride}: expected at least 1 frame"):
             use(stride)
 
@@ -107,7 +115,9 @@ def test_what_is_no_array_is_refused(observation):
 
 def test_frames_that_do_not_fit_are_refused():
     frames = random_frames(2)
-    with pytest.raises(ValueError, match=r"\(64, 64, 3\).*\(32, 64, 3\).*two uint8 arrays of one shape"):
+    with pytest.raises(
+        ValueError, match=r"\(64, 64, 3\).*\(32, 64, 3\).*two uint8 arrays of one shape"
+    ):
         difference_image(frames[0], frames[1][:32])
     with pytest.raises(ValueError, match=r"float64.*two uint8 arrays"):
         difference_image(frames[0] / 255, frames[1])

@@ -44,7 +44,9 @@ def test_a_script_with_gymnasium_alone_finds_the_same_return(official, straight_
         total, frames, ended = total + reward, frames + 1, terminated or truncated
     assert official["renderer"] == "official"
     assert 200 < frames < 1000 and terminated  # off the field, at the cost of 100
-    assert official["episodes"] == [{"track": TRACK, "return": pytest.approx(total, abs=1e-6), "frames": frames}]
+    assert official["episodes"] == [
+        {"track": TRACK, "return": pytest.approx(total, abs=1e-6), "frames": frames}
+    ]
 
 
 def test_every_episode_is_on_record(fast):
@@ -62,7 +64,10 @@ def test_an_evaluation_goes_to_the_screen_and_to_a_file_that_is_not_the_official
 ):
     run = shutil.copytree(straight_run, tmp_path / "run")
     arguments = ["evaluate", "--variant", "input_output", "--path", run, "--fast", "--episodes", 2]
-    assert main([str(argument) for argument in (*arguments, "--first-track", 10, "--processes", 1)]) == 0
+    assert (
+        main([str(argument) for argument in (*arguments, "--first-track", 10, "--processes", 1)])
+        == 0
+    )
     told = capsys.readouterr().out
     file = run / "evaluation-input_output-fast-from-10-2-tracks.json"
     result = load_json(file)
@@ -85,7 +90,9 @@ def test_a_result_names_the_controller_that_drove_if_a_search_finds_a_better_one
     assert evaluate("input_output", run, episodes=1)["controller_sha256"] == checksum(drove)
 
 
-def test_a_controller_that_changes_while_it_is_read_is_read_again(straight_run, tmp_path, monkeypatch):
+def test_a_controller_that_changes_while_it_is_read_is_read_again(
+    straight_run, tmp_path, monkeypatch
+):
     run, readings = shutil.copytree(straight_run, tmp_path / "run"), []
     file = run / "controller.safetensors"
     old = load_controller(file, "input_output")
@@ -93,22 +100,31 @@ def test_a_controller_that_changes_while_it_is_read_is_read_again(straight_run, 
     def read_and_save_a_better_one(*given):
         agent = load_agent(*given)
         if len(readings) < 2:  # the first reading, and the one between the two checksums
-            save_controller(file, old[0] + len(readings) + 1, **{k: v for k, v in old[1].items() if k != "part"})
+            save_controller(
+                file, old[0] + len(readings) + 1, **{k: v for k, v in old[1].items() if k != "part"}
+            )
         readings.append(agent.parameters)
         return agent
 
     monkeypatch.setattr("stad_lab.evaluation.evaluate.load_agent", read_and_save_a_better_one)
     driven = []
     monkeypatch.setattr(
-        "stad_lab.evaluation.evaluate.run_tasks", lambda *given: driven.append(given[2]) or [(0, ([1.0], [7]))]
+        "stad_lab.evaluation.evaluate.run_tasks",
+        lambda *given: driven.append(given[2]) or [(0, ([1.0], [7]))],
     )
     found = evaluate("input_output", run, episodes=1)
     assert found["controller_sha256"] == checksum(file.read_bytes())
     assert np.array_equal(driven[0][0][2], load_controller(file, "input_output")[0])
 
 
-def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straight_run, fast, tmp_path, monkeypatch):
-    chosen, file, done = ("input_output", straight_run, 2, 10, True), tmp_path / "unfinished.json", []
+def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(
+    straight_run, fast, tmp_path, monkeypatch
+):
+    chosen, file, done = (
+        ("input_output", straight_run, 2, 10, True),
+        tmp_path / "unfinished.json",
+        [],
+    )
 
     def refuse_to_write(*given):
         raise OSError("[Errno 28] No space left on device")
@@ -122,13 +138,17 @@ def test_an_interrupted_evaluation_goes_on_with_the_tracks_that_are_left(straigh
     with pytest.raises(KeyboardInterrupt):
         evaluate(*chosen, unfinished=file)
     monkeypatch.setattr(
-        "stad_lab.evaluation.evaluate.run_tasks", lambda *given: done.append(len(given[2])) or run_tasks(*given)
+        "stad_lab.evaluation.evaluate.run_tasks",
+        lambda *given: done.append(len(given[2])) or run_tasks(*given),
     )
     result = evaluate(*chosen, unfinished=file)
     assert done == [2, 1] and result | {"seconds": 0} == fast | {"seconds": 0}
     drove = load_json(file)
     monkeypatch.setattr("stad_lab.evaluation.evaluate.save_json", refuse_to_write)
-    for other in ({"controller_sha256": "of another C"}, {"weights": ["of the same V, half as precise", "of M"]}):
+    for other in (
+        {"controller_sha256": "of another C"},
+        {"weights": ["of the same V, half as precise", "of M"]},
+    ):
         save_json(file, drove | {"identity": drove["identity"] | other})
         assert evaluate(*chosen, unfinished=file)["episodes"] == fast["episodes"] and done[-1] == 2
 
@@ -149,16 +169,27 @@ def test_the_command_goes_on_with_the_tracks_that_are_left(straight_run, tmp_pat
     assert not list(run.glob("unfinished*"))
 
 
-def test_an_evaluation_is_written_though_nobody_reads_what_is_printed(straight_run, tmp_path, monkeypatch):
+def test_an_evaluation_is_written_though_nobody_reads_what_is_printed(
+    straight_run, tmp_path, monkeypatch
+):
     class Closed(io.StringIO):
         def write(self, text):
             raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
     monkeypatch.setattr(
-        "stad_lab.evaluation.evaluate.run_tasks", lambda *given: [(0, (np.array([5.0]), np.array([7])))]
+        "stad_lab.evaluation.evaluate.run_tasks",
+        lambda *given: [(0, (np.array([5.0]), np.array([7])))],
     )
     monkeypatch.setattr("sys.stdout", Closed())
-    command = ["evaluate", "--variant", "input_output", "--path", str(straight_run), "--episodes", "1"]
+    command = [
+        "evaluate",
+        "--variant",
+        "input_output",
+        "--path",
+        str(straight_run),
+        "--episodes",
+        "1",
+    ]
     assert main([*command, "--json", str(tmp_path / "evaluation.json")]) == 2
     assert [file.name for file in tmp_path.iterdir()] == ["evaluation.json"]
     assert load_json(tmp_path / "evaluation.json")["mean"] == 5.0
@@ -184,7 +215,9 @@ def test_the_summary_of_a_few_returns_by_hand():
 def test_the_interval_is_that_of_the_mean():
     returns = np.random.default_rng(0).normal(500, 100, 400)
     error = 1.96 * returns.std(ddof=1) / 20
-    assert summarise(returns)["interval"] == pytest.approx([returns.mean() - error, returns.mean() + error], abs=1)
+    assert summarise(returns)["interval"] == pytest.approx(
+        [returns.mean() - error, returns.mean() + error], abs=1
+    )
     assert summarise(np.full(7, 321.0))["interval"] == [321, 321]
 
 
@@ -198,7 +231,8 @@ def test_one_episode_has_no_deviation():
 
 
 @pytest.mark.parametrize(
-    ("first", "episodes"), [(-1, 1), (TRACK_RANGES["test"][1], 1), (999_950, 100), (0, 0), (0, 10_001)]
+    ("first", "episodes"),
+    [(-1, 1), (TRACK_RANGES["test"][1], 1), (999_950, 100), (0, 0), (0, 10_001)],
 )
 def test_tracks_outside_the_test_range_are_refused(first, episodes, straight_run):
     message = f"episodes={episodes} from first_track={first}: expected 1 to 10000 episodes, on tracks 0 to 999999"
@@ -208,7 +242,10 @@ def test_tracks_outside_the_test_range_are_refused(first, episodes, straight_run
 
 def test_official_means_gymnasium_s_own_environment(straight_run, monkeypatch):
     made = []
-    monkeypatch.setattr("stad_lab.agent.make_env", lambda fast=True, **how: made.append(fast) or make_env(True, **how))
+    monkeypatch.setattr(
+        "stad_lab.agent.make_env",
+        lambda fast=True, **how: made.append(fast) or make_env(True, **how),
+    )
     with ThreadPoolExecutor(1) as executor:
         for fast in (False, True):
             evaluate("input_output", straight_run, 1, 3, fast, executor=executor)

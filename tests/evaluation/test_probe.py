@@ -15,7 +15,11 @@ def planted(drives=40, length=50, noise=0.5, seed=0):
     signal = features @ rng.standard_normal(32)
     signal /= signal.std()
     target = signal + noise * rng.standard_normal(len(signal))
-    return features, np.stack([target, rng.standard_normal(len(signal))], axis=1), np.repeat(np.arange(drives), length)
+    return (
+        features,
+        np.stack([target, rng.standard_normal(len(signal))], axis=1),
+        np.repeat(np.arange(drives), length),
+    )
 
 
 def test_a_planted_linear_signal_is_found_with_its_own_r2():
@@ -45,7 +49,10 @@ def test_what_identifies_a_drive_is_not_mistaken_for_a_signal():
 def test_an_interval_is_over_drives_and_does_not_narrow_if_their_rows_are_repeated():
     rng, (features, targets, drives) = np.random.default_rng(0), planted(drives=20, length=10)
     targets = targets + rng.standard_normal(20)[drives][:, None]  # drives differ
-    once, often = (probe(*(np.repeat(part, n, axis=0) for part in (features, targets, drives))) for n in (1, 30))
+    once, often = (
+        probe(*(np.repeat(part, n, axis=0) for part in (features, targets, drives)))
+        for n in (1, 30)
+    )
     widths = [found["high"] - found["low"] for found in (once, often)]
     assert widths[1] == pytest.approx(widths[0], rel=0.3)
 
@@ -53,14 +60,19 @@ def test_an_interval_is_over_drives_and_does_not_narrow_if_their_rows_are_repeat
 def test_the_penalty_is_chosen_on_drives_that_the_r2_is_not_measured_on(monkeypatch):
     asked = []
     monkeypatch.setattr(
-        "stad_lab.evaluation.probe.choose_penalties", lambda *given: asked.append(given[2:]) or np.ones(2)
+        "stad_lab.evaluation.probe.choose_penalties",
+        lambda *given: asked.append(given[2:]) or np.ones(2),
     )
     features, targets, drives = planted()
     found = probe(features, targets, drives)["r2"]
     ((fit, trial),) = asked
-    assert not set(drives[fit]) & set(drives[trial]) and len(set(drives[fit | trial])) == 24  # of forty
+    assert (
+        not set(drives[fit]) & set(drives[trial]) and len(set(drives[fit | trial])) == 24
+    )  # of forty
     targets[fit | trial] = 0.0  # what is measured are the others: nothing that was fitted is left
-    assert found[0] > 0.7 and probe(features, targets + 1e-9 * features[:, :2], drives)["r2"][0] < 0.1
+    assert (
+        found[0] > 0.7 and probe(features, targets + 1e-9 * features[:, :2], drives)["r2"][0] < 0.1
+    )
 
 
 def test_the_same_seed_gives_the_same_numbers():
@@ -84,6 +96,8 @@ def test_rows_that_cannot_be_probed_are_refused(change, message):
 
 def test_an_interval_holds_the_middle_95_percent_of_the_resamples(monkeypatch):
     count = itertools.count()
-    monkeypatch.setattr("stad_lab.evaluation.probe.r2_of_sums", lambda sums: np.full(2, float(next(count))))
+    monkeypatch.setattr(
+        "stad_lab.evaluation.probe.r2_of_sums", lambda sums: np.full(2, float(next(count)))
+    )
     found = probe(*planted(), resamples=1001)
     assert found["low"] == pytest.approx([25, 25]) and found["high"] == pytest.approx([975, 975])

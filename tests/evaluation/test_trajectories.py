@@ -34,7 +34,9 @@ def motion_of(env):
     return dict(zip(MOTION, true_motion(env).tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("tile", "speed", "turn", "offset"), [(0, 0, 0, 0), (40, 50, 0.2, 0.5), (120, 20, -0.3, -0.6)])
+@pytest.mark.parametrize(
+    ("tile", "speed", "turn", "offset"), [(0, 0, 0, 0), (40, 50, 0.2, 0.5), (120, 20, -0.3, -0.6)]
+)
 def test_the_motion_is_that_which_the_car_was_given(tile, speed, turn, offset):
     env = make_env()
     env.reset(seed=5)
@@ -42,7 +44,9 @@ def test_the_motion_is_that_which_the_car_was_given(tile, speed, turn, offset):
     motion = motion_of(env)
     assert motion["forward speed"] == pytest.approx(speed, abs=0.01)
     assert motion["slip speed"] == pytest.approx(0, abs=0.01) and motion["yaw rate"] == 0
-    assert motion["road offset"] == pytest.approx(offset, abs=0.1)  # the nearest tile may be the next one
+    assert motion["road offset"] == pytest.approx(
+        offset, abs=0.1
+    )  # the nearest tile may be the next one
     assert motion["heading error"] == pytest.approx(turn, abs=0.15)
     env.close()
 
@@ -53,7 +57,9 @@ def test_speed_ahead_and_aside_are_told_apart_and_left_is_positive():
     place_car(env, 30, speed=40)
     hull = env.unwrapped.car.hull
     hull.linearVelocity = 3 * hull.GetWorldVector((0, 1)) + 4 * hull.GetWorldVector((1, 0))
-    assert [motion_of(env)[name] for name in ("forward speed", "slip speed")] == pytest.approx([3, 4], abs=1e-4)
+    assert [motion_of(env)[name] for name in ("forward speed", "slip speed")] == pytest.approx(
+        [3, 4], abs=1e-4
+    )
     for _ in range(12):
         env.step(np.array([-1, 0.2, 0], np.float32))  # steering to the left
     motion = motion_of(env)
@@ -70,7 +76,12 @@ def test_the_road_is_in_sight_near_it_and_along_it_only():
 
 def test_a_random_drive_is_that_of_the_rollouts_on_a_track_of_its_own(random_drive):
     frames, actions, _ = drive_randomly(SETTINGS, 0)
-    assert len(random_drive) == len(random_drive.frames(True)) == len(random_drive.motion) == len(random_drive.rewards)
+    assert (
+        len(random_drive)
+        == len(random_drive.frames(True))
+        == len(random_drive.motion)
+        == len(random_drive.rewards)
+    )
     assert np.array_equal(random_drive.actions[: len(actions)], actions[: len(random_drive)])
     assert not np.array_equal(random_drive.frames(True)[0], frames[0])  # another track
     again = record_random_drive(SETTINGS, 0)

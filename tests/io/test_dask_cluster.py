@@ -32,15 +32,33 @@ SETTINGS = Settings.preset("quick")
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory):
     """Its address, and the processes of its workers by their names."""
-    folder, quiet = tmp_path_factory.mktemp("cluster"), {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    quiet["env"] = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}  # for the tasks that are written here
+    folder, quiet = (
+        tmp_path_factory.mktemp("cluster"),
+        {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL},
+    )
+    quiet["env"] = os.environ | {
+        "PYTHONPATH": str(Path(__file__).parents[1])
+    }  # for the tasks that are written here
     dask, contact = [sys.executable, "-m", "dask"], folder / "scheduler.json"
     options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
-    processes = [subprocess.Popen([*dask, "scheduler", *options, "--scheduler-file", contact], cwd=folder, **quiet)]
+    processes = [
+        subprocess.Popen(
+            [*dask, "scheduler", *options, "--scheduler-file", contact], cwd=folder, **quiet
+        )
+    ]
     wait_for(contact.exists)
     time.sleep(0.5)
     address = load_address(contact)
-    options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1", "--local-directory", folder]
+    options = [
+        "--nthreads",
+        "1",
+        "--no-nanny",
+        "--no-dashboard",
+        "--host",
+        "127.0.0.1",
+        "--local-directory",
+        folder,
+    ]
     workers = {
         f"worker{number}": subprocess.Popen(
             [*dask, "worker", address, "--name", f"worker{number}", *options], cwd=folder, **quiet
@@ -89,8 +107,13 @@ def open_parcel(parcel, number):
 def test_what_is_shared_travels_once_to_every_worker_and_not_with_each_task(scheduler):
     with cluster(scheduler[0]) as executor:
         parcel = executor.share(Parcel())
-        time.sleep(2.5)  # longer than Dask's memory manager waits until it drops what no task is waiting for
-        found = [future.result() for future in [executor.submit(open_parcel, parcel, number) for number in range(40)]]
+        time.sleep(
+            2.5
+        )  # longer than Dask's memory manager waits until it drops what no task is waiting for
+        found = [
+            future.result()
+            for future in [executor.submit(open_parcel, parcel, number) for number in range(40)]
+        ]
     assert len({process for process, _ in found}) == WORKERS
     assert max(arrived for _, arrived in found) == 1
     with Client(scheduler[0], set_as_default=False) as client:
@@ -114,22 +137,38 @@ def test_an_evaluation_on_a_cluster_is_the_same_to_the_last_bit(scheduler, strai
 
 def test_the_command_line_evolves_on_a_cluster(scheduler, quick_run, tmp_path, capsys):
     folder = start_of("controller", quick_run, tmp_path / "run")
-    command = ["train", "--variant", VARIANT, "--settings", "quick", "--scheduler", scheduler[0], "--out", str(folder)]
+    command = [
+        "train",
+        "--variant",
+        VARIANT,
+        "--settings",
+        "quick",
+        "--scheduler",
+        scheduler[0],
+        "--out",
+        str(folder),
+    ]
     assert main(command) == 0
     assert_equal_results(folder, quick_run, "controller")
 
 
-def test_the_command_line_makes_a_row_of_the_table_on_a_cluster(scheduler, tmp_path, monkeypatch, capsys):
+def test_the_command_line_makes_a_row_of_the_table_on_a_cluster(
+    scheduler, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(replication, "TRACKS", 3)
     row, episodes = ["replicate", "--row", "gentle_driver", "--out"], []
     for folder, where in (("far", ["--scheduler", scheduler[0]]), ("near", [])):
         assert main([*row, str(tmp_path / folder), *where]) == 0
-        episodes.append(load_json(tmp_path / folder / "gentle_driver" / "seed0" / "evaluation.json")["episodes"])
+        episodes.append(
+            load_json(tmp_path / folder / "gentle_driver" / "seed0" / "evaluation.json")["episodes"]
+        )
     assert len(episodes[0]) == 3 and episodes[0] == episodes[1]
     assert "gentle_driver: at most" in capsys.readouterr().out
 
 
-def test_a_worker_killed_in_mid_generation_costs_a_retry_and_not_the_run(scheduler, quick_run, tmp_path):
+def test_a_worker_killed_in_mid_generation_costs_a_retry_and_not_the_run(
+    scheduler, quick_run, tmp_path
+):
     address, workers = scheduler
     folder = start_of("controller", quick_run, tmp_path / "run")
     with cluster(address) as executor:
@@ -155,22 +194,37 @@ def test_a_worker_killed_in_mid_generation_costs_a_retry_and_not_the_run(schedul
 
 def busy(executor):
     """The names of the workers that have a task."""
-    names = {address: worker["name"] for address, worker in executor._client.scheduler_info()["workers"].items()}
-    return [names[address] for address, tasks in executor._client.processing().items() if tasks and address in names]
+    names = {
+        address: worker["name"]
+        for address, worker in executor._client.scheduler_info()["workers"].items()
+    }
+    return [
+        names[address]
+        for address, tasks in executor._client.processing().items()
+        if tasks and address in names
+    ]
 
 
 def test_a_lost_scheduler_is_told_in_one_line_and_does_not_hide_what_was_done():
     lost = LocalCluster(n_workers=1, processes=False, protocol="tcp://", dashboard_address=None)
-    with lost, cluster(lost.scheduler_address) as executor:  # and to leave this block raises nothing
+    with (
+        lost,
+        cluster(lost.scheduler_address) as executor,
+    ):  # and to leave this block raises nothing
         executor._client.close()  # as it does by itself, a minute after it has lost its scheduler
-        with pytest.raises(TaskError, match="what workers share failed in a worker: ClosedClientError"):
+        with pytest.raises(
+            TaskError, match="what workers share failed in a worker: ClosedClientError"
+        ):
             executor.share(b"V and M")
         with pytest.raises(TaskError, match="int failed in a worker: ClosedClientError"):
             list(run_tasks(executor, int, [()]))
 
 
 def test_a_task_that_is_cancelled_from_outside_is_told_with_the_remedy():
-    with cancelling_executor() as executor, pytest.raises(TaskError, match="sleep was cancelled, as when a scheduler"):
+    with (
+        cancelling_executor() as executor,
+        pytest.raises(TaskError, match="sleep was cancelled, as when a scheduler"),
+    ):
         list(run_tasks(executor, time.sleep, [(1,)]))
 
 
@@ -192,22 +246,31 @@ def cancelled(future):
 
 def test_an_address_without_a_scheduler_is_an_error_that_says_how_to_start_one():
     with (
-        pytest.raises(OSError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"),
+        pytest.raises(
+            OSError, match=r"no Dask scheduler answers at 'tcp://127.0.0.1:9'.*dask scheduler"
+        ),
         cluster("tcp://127.0.0.1:9", patience=1),
     ):
         pass
 
 
-@pytest.mark.parametrize("address", ["127.0.0.1", "nonsense", "http://127.0.0.1:8787/status", "tls://127.0.0.1:9"])
+@pytest.mark.parametrize(
+    "address", ["127.0.0.1", "nonsense", "http://127.0.0.1:8787/status", "tls://127.0.0.1:9"]
+)
 def test_what_is_no_address_of_a_scheduler_is_refused_before_a_client_is_made(address, monkeypatch):
     monkeypatch.setattr("stad_lab.io.dask_cluster.Client", None)
-    with pytest.raises(ValueError, match=rf"'{address}': expected the address that it prints"), cluster(address):
+    with (
+        pytest.raises(ValueError, match=rf"'{address}': expected the address that it prints"),
+        cluster(address),
+    ):
         pass
 
 
 def test_a_tls_address_may_be_tried_with_certificates(monkeypatch):
     found = {"ssl_context": object()}
-    monkeypatch.setattr("stad_lab.io.dask_cluster.Security.get_connection_args", lambda *given: found)
+    monkeypatch.setattr(
+        "stad_lab.io.dask_cluster.Security.get_connection_args", lambda *given: found
+    )
     check_address("tls://127.0.0.1:9")
     found.clear()
     with pytest.raises(ValueError, match="needs certificates"):
@@ -223,14 +286,22 @@ def test_a_scheduler_without_workers_is_an_error_that_says_how_to_start_one():
 
 def test_a_cluster_whose_workers_have_other_versions_is_refused(scheduler, monkeypatch):
     installed = importlib.metadata.version
-    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.1" if name == "numpy" else installed(name))
-    with pytest.raises(ValueError, match=r"worker tcp://.* has numpy .*, here it is 0\.1"), cluster(scheduler[0]):
+    monkeypatch.setattr(
+        "importlib.metadata.version", lambda name: "0.1" if name == "numpy" else installed(name)
+    )
+    with (
+        pytest.raises(ValueError, match=r"worker tcp://.* has numpy .*, here it is 0\.1"),
+        cluster(scheduler[0]),
+    ):
         pass
 
 
 def test_a_worker_that_lacks_a_package_is_refused(scheduler, monkeypatch):
     monkeypatch.setattr("stad_lab.io.dask_cluster.versions", lack_a_package)
-    with pytest.raises(ValueError, match=r"a worker of tcp://.* lacks a package \(.*nowhere"), cluster(scheduler[0]):
+    with (
+        pytest.raises(ValueError, match=r"a worker of tcp://.* lacks a package \(.*nowhere"),
+        cluster(scheduler[0]),
+    ):
         pass
 
 
@@ -239,5 +310,7 @@ def lack_a_package():
 
 
 def test_a_worker_with_other_versions_is_named():
-    with pytest.raises(ValueError, match=r"worker tcp://far has torch 1.0, here it is .*install the same"):
+    with pytest.raises(
+        ValueError, match=r"worker tcp://far has torch 1.0, here it is .*install the same"
+    ):
         check_versions({"tcp://near": versions(), "tcp://far": versions() | {"torch": "1.0"}})

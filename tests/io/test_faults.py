@@ -53,7 +53,10 @@ def in_this_process():
 def whole(quick_run, tmp_path_factory, in_this_process):
     """A finished run with an evaluation, and the checkpoints of trainings that were interrupted half way."""
     folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("faults") / "whole")
-    save_json(folder / "evaluation.json", evaluate(VARIANT, folder, 1, fast=True, executor=in_this_process))
+    save_json(
+        folder / "evaluation.json",
+        evaluate(VARIANT, folder, 1, fast=True, executor=in_this_process),
+    )
     add_checkpoints(folder, SETTINGS)
     return folder
 
@@ -61,7 +64,10 @@ def whole(quick_run, tmp_path_factory, in_this_process):
 @pytest.fixture(scope="module")
 def another(tmp_path_factory, whole, in_this_process):
     """A run of another seed, with checkpoints too."""
-    folder, settings = tmp_path_factory.mktemp("faults") / "another", Settings.preset("quick", seed=1, generations=2)
+    folder, settings = (
+        tmp_path_factory.mktemp("faults") / "another",
+        Settings.preset("quick", seed=1, generations=2),
+    )
     train(VARIANT, settings, folder, executor=in_this_process)
     own = {"controller_sha256": checksum((folder / "controller.safetensors").read_bytes())}
     save_json(folder / "evaluation.json", load_json(whole / "evaluation.json") | own)
@@ -73,7 +79,10 @@ def add_checkpoints(folder, settings):
     """Interrupt a training of V and one of M after ten steps, and keep their checkpoints beside the finished run."""
     trainings = {"autoencoder": train_autoencoder, "mdn_rnn": train_mdn_rnn}
     for part, again in trainings.items():
-        finished, content = folder / f"{part}.safetensors", (folder / f"{part}.safetensors").read_bytes()
+        finished, content = (
+            folder / f"{part}.safetensors",
+            (folder / f"{part}.safetensors").read_bytes(),
+        )
         finished.unlink()
         left = [10]
 
@@ -182,13 +191,18 @@ def assert_refused(read, folder, name, what):
     assert re.search(remedy, message), (name, what, message)
     after = snapshot(folder)
     removed = {path for path in before if path not in after}
-    assert removed <= {folder / "autoencoder.safetensors", folder / "mdn_rnn.safetensors"}  # by resume_training itself
+    assert removed <= {
+        folder / "autoencoder.safetensors",
+        folder / "mdn_rnn.safetensors",
+    }  # by resume_training itself
     assert all(after[path] == before[path] for path in after), (name, what)
 
 
 def copy_for(name, run, folder):
     """A copy of a run, without the checkpoints unless one of them is to be broken: beside weights they are deleted."""
-    shutil.copytree(run, folder, ignore=shutil.ignore_patterns(*() if name in CHECKPOINTS else CHECKPOINTS))
+    shutil.copytree(
+        run, folder, ignore=shutil.ignore_patterns(*() if name in CHECKPOINTS else CHECKPOINTS)
+    )
     return folder
 
 
@@ -210,11 +224,15 @@ def test_a_damaged_file_is_refused_before_use_and_stays_as_it_is(name, whole, tm
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_file_of_another_run_is_refused_before_use(name, whole, another, tmp_path, in_this_process):
+def test_a_file_of_another_run_is_refused_before_use(
+    name, whole, another, tmp_path, in_this_process
+):
     folder = copy_for(name, whole, tmp_path / "run")
     shutil.copy(another / name, folder / name)
     if name == "evaluation.json":
-        assert verify(folder, in_this_process)["evaluations"].startswith(f"FAILED: {folder / name} tells of another")
+        assert verify(folder, in_this_process)["evaluations"].startswith(
+            f"FAILED: {folder / name} tells of another"
+        )
         return
     for read in READERS[name]:
         assert_refused(read, folder, name, "of another run")
@@ -236,14 +254,31 @@ def test_a_file_that_may_not_be_read_is_an_error_that_says_so(whole, tmp_path):
 
 def stage_command(folder, stage):
     """The command that runs everything up to a stage."""
-    command = [sys.executable, "-m", "stad_lab", "train", "--variant", VARIANT, "--settings", "quick"]
+    command = [
+        sys.executable,
+        "-m",
+        "stad_lab",
+        "train",
+        "--variant",
+        VARIANT,
+        "--settings",
+        "quick",
+    ]
     return [*command, "--out", str(folder), "--until", stage]
 
 
 def start_of(stage, run, folder):
     """A copy of a finished run in which the stage has not begun."""
-    results = ("rollouts", "autoencoder.safetensors", "mdn_rnn.safetensors", "evolution.json", "controller.safetensors")
-    return shutil.copytree(run, folder, ignore=shutil.ignore_patterns(*results[STAGES.index(stage) :], "*.training.*"))
+    results = (
+        "rollouts",
+        "autoencoder.safetensors",
+        "mdn_rnn.safetensors",
+        "evolution.json",
+        "controller.safetensors",
+    )
+    return shutil.copytree(
+        run, folder, ignore=shutil.ignore_patterns(*results[STAGES.index(stage) :], "*.training.*")
+    )
 
 
 def kill_at_random(stage, run, tmp_path, kills):
@@ -251,7 +286,9 @@ def kill_at_random(stage, run, tmp_path, kills):
     rng, killed, folder = random.Random(stage), 0, start_of(stage, run, tmp_path / "run0")
     duration = load_json(run / "record.json")["seconds"][stage]
     while killed < kills:
-        process = subprocess.Popen(stage_command(folder, stage), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            stage_command(folder, stage), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+        )
         before = STAGES.index(stage)
         while before:  # every stage before it says that there is nothing to do
             line = process.stdout.readline()
@@ -260,7 +297,9 @@ def kill_at_random(stage, run, tmp_path, kills):
         begin = time.perf_counter()
         try:
             process.wait(rng.uniform(0, duration))
-            duration = time.perf_counter() - begin  # it was done already, so it is quicker now: from the start
+            duration = (
+                time.perf_counter() - begin
+            )  # it was done already, so it is quicker now: from the start
             folder = start_of(stage, run, tmp_path / f"run{killed}-{rng.random()}")
         except subprocess.TimeoutExpired:
             process.kill()
@@ -272,8 +311,16 @@ def kill_at_random(stage, run, tmp_path, kills):
 
 def assert_equal_results(folder, run, stage):
     """Everything up to the stage is the same to the last bit, and no half-written file is left."""
-    results = sorted(path.relative_to(run) for path in run.rglob("*") if path.is_file() and path.name != "record.json")
-    later = {"autoencoder": ["mdn", "evo", "con"], "mdn_rnn": ["evo", "con"], "rollouts": ["aut", "mdn", "evo", "con"]}
+    results = sorted(
+        path.relative_to(run)
+        for path in run.rglob("*")
+        if path.is_file() and path.name != "record.json"
+    )
+    later = {
+        "autoencoder": ["mdn", "evo", "con"],
+        "mdn_rnn": ["evo", "con"],
+        "rollouts": ["aut", "mdn", "evo", "con"],
+    }
     for path in results:
         if not path.name.startswith((".", *later.get(stage, []))):
             assert (folder / path).read_bytes() == (run / path).read_bytes(), path
@@ -281,24 +328,35 @@ def assert_equal_results(folder, run, stage):
 
 
 def test_a_killed_training_goes_on_to_the_same_bits(quick_run, tmp_path):
-    assert_equal_results(kill_at_random("autoencoder", quick_run, tmp_path, 1), quick_run, "autoencoder")
+    assert_equal_results(
+        kill_at_random("autoencoder", quick_run, tmp_path, 1), quick_run, "autoencoder"
+    )
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_stage_killed_at_twenty_random_moments_ends_with_the_same_bits(stage, quick_run, tmp_path):
+def test_a_stage_killed_at_twenty_random_moments_ends_with_the_same_bits(
+    stage, quick_run, tmp_path
+):
     assert_equal_results(kill_at_random(stage, quick_run, tmp_path, 20), quick_run, stage)
 
 
-def test_half_written_files_of_a_killed_process_are_cleared_away(quick_run, tmp_path, in_this_process):
+def test_half_written_files_of_a_killed_process_are_cleared_away(
+    quick_run, tmp_path, in_this_process
+):
     folder = start_of("controller", quick_run, tmp_path / "run")
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
-    left_over, others = folder / f".evolution.json.{ended.pid}.part", [".thesis.zip.part", f".log.{os.getppid()}.part"]
+    left_over, others = (
+        folder / f".evolution.json.{ended.pid}.part",
+        [".thesis.zip.part", f".log.{os.getppid()}.part"],
+    )
     for name in (left_over.name, *others):
         (folder / name).write_bytes(b"{")
     evolve(VARIANT, SETTINGS, folder, in_this_process)
-    assert not left_over.exists() and all((folder / name).exists() for name in others)  # somebody's, or still written
+    assert not left_over.exists() and all(
+        (folder / name).exists() for name in others
+    )  # somebody's, or still written
 
 
 # Workers
@@ -306,8 +364,12 @@ def test_half_written_files_of_a_killed_process_are_cleared_away(quick_run, tmp_
 
 def test_work_of_a_killed_worker_is_done_again(tmp_path, capfd):
     with worker_processes(2) as executor:
-        tasks = [(tmp_path / "marker", number) for number in range(600)]  # many: it dies while others are handed in
-        assert dict(run_tasks(executor, die_once, tasks)) == {number: number for number in range(600)}
+        tasks = [
+            (tmp_path / "marker", number) for number in range(600)
+        ]  # many: it dies while others are handed in
+        assert dict(run_tasks(executor, die_once, tasks)) == {
+            number: number for number in range(600)
+        }
     assert "a worker process was lost: starting new ones" in capfd.readouterr().err
 
 
@@ -371,7 +433,9 @@ def test_an_environment_that_raises_stops_the_run_with_its_cause_and_the_run_goe
         return drive(*arguments, **named)
 
     monkeypatch.setattr(evolution, "drive", fragile)
-    with pytest.raises(TaskError, match="drive_group failed in a worker: RuntimeError: the track has fallen apart"):
+    with pytest.raises(
+        TaskError, match="drive_group failed in a worker: RuntimeError: the track has fallen apart"
+    ):
         evolve(VARIANT, SETTINGS, folder, in_this_process)
     assert 1 <= len(load_json(folder / "evolution.json")["generations"]) < SETTINGS.generations
     evolve(VARIANT, SETTINGS, folder, in_this_process)
@@ -383,13 +447,18 @@ def test_an_environment_that_raises_stops_the_run_with_its_cause_and_the_run_goe
 
 def test_two_processes_do_not_share_a_run_folder(quick_run, tmp_path, capsys):
     folder = start_of("mdn_rnn", quick_run, tmp_path / "run")
-    holder = "import sys, time; from filelock import FileLock\n"  # as `locked` does, without its imports
+    holder = (
+        "import sys, time; from filelock import FileLock\n"  # as `locked` does, without its imports
+    )
     holder += "with FileLock(sys.argv[1] + '/.lock'): print('held', flush=True); time.sleep(1000)"
     process = subprocess.Popen([sys.executable, "-c", holder, folder], stdout=subprocess.PIPE)
     assert process.stdout.readline().strip() == b"held"
     before = snapshot(folder)
     assert main([*stage_command(folder, "mdn_rnn")[3:]]) == 2
-    assert f"error: {folder} is in use by another process: wait until that has ended" in capsys.readouterr().err
+    assert (
+        f"error: {folder} is in use by another process: wait until that has ended"
+        in capsys.readouterr().err
+    )
     assert snapshot(folder) == before
     process.kill()  # and the lock is free at once
     process.wait()
@@ -416,13 +485,17 @@ def small_disk(tmp_path):
         subprocess.run(["umount", folder], check=True)
 
 
-def test_a_full_disk_stops_the_run_in_one_line_and_more_room_lets_it_go_on(small_disk, quick_run, capsys):
+def test_a_full_disk_stops_the_run_in_one_line_and_more_room_lets_it_go_on(
+    small_disk, quick_run, capsys
+):
     disk = small_disk(8)
     run = start_of("autoencoder", quick_run, disk / "run")
     (disk / "ballast").write_bytes(bytes(max(0, shutil.disk_usage(disk).free - 500_000)))
     assert main(stage_command(run, "autoencoder")[3:]) == 2
     error = capsys.readouterr().err.splitlines()[-1]
-    assert re.match(r"error: .*could not be written \(No space left on device\): see to free room", error)
+    assert re.match(
+        r"error: .*could not be written \(No space left on device\): see to free room", error
+    )
     assert not (run / "autoencoder.safetensors").exists()
     small_disk(64)
     assert main(stage_command(run, "autoencoder")[3:]) == 0
@@ -434,15 +507,28 @@ def test_a_read_only_folder_is_refused_before_any_work(small_disk, quick_run, ca
     run = start_of("mdn_rnn", quick_run, disk / "run")
     small_disk(64, "ro")
     assert main(stage_command(run, "mdn_rnn")[3:]) == 2
-    assert f"error: {run} is no folder to write to (Read-only file system): choose" in capsys.readouterr().err
+    assert (
+        f"error: {run} is no folder to write to (Read-only file system): choose"
+        in capsys.readouterr().err
+    )
     begin = time.perf_counter()
-    evaluation = ["evaluate", "--variant", VARIANT, "--path", quick_run, "--json", disk / "evaluation.json"]
+    evaluation = [
+        "evaluate",
+        "--variant",
+        VARIANT,
+        "--path",
+        quick_run,
+        "--json",
+        disk / "evaluation.json",
+    ]
     assert main([str(argument) for argument in evaluation]) == 2
     assert "evaluation.json could not be written (Read-only file system)" in capsys.readouterr().err
     assert time.perf_counter() - begin < 10  # not after the drive
 
 
-@pytest.mark.parametrize(("refusals", "patience", "found"), [(2, 1.0, b"new"), (10_000, 0.1, b"old")])
+@pytest.mark.parametrize(
+    ("refusals", "patience", "found"), [(2, 1.0, b"new"), (10_000, 0.1, b"old")]
+)
 def test_a_file_that_a_scanner_holds_for_a_moment_is_written_a_moment_later(
     refusals, patience, found, tmp_path, monkeypatch
 ):
@@ -457,7 +543,11 @@ def test_a_file_that_a_scanner_holds_for_a_moment_is_written_a_moment_later(
 
     monkeypatch.setattr("stad_lab.io.files.PATIENCE", patience)
     monkeypatch.setattr(Path, "replace", refuse)
-    with contextlib.nullcontext() if found == b"new" else pytest.raises(OSError, match="could not be written"):
+    with (
+        contextlib.nullcontext()
+        if found == b"new"
+        else pytest.raises(OSError, match="could not be written")
+    ):
         write_bytes(file, b"new")
     assert file.read_bytes() == found and list(tmp_path.iterdir()) == [file]
 
@@ -478,7 +568,9 @@ def test_a_file_too_large_for_the_quota_leaves_the_old_one(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
-@pytest.mark.skipif(os.name == "nt", reason="Windows cannot open a folder, so none is flushed there")
+@pytest.mark.skipif(
+    os.name == "nt", reason="Windows cannot open a folder, so none is flushed there"
+)
 def test_a_share_that_cannot_flush_a_folder_takes_files_all_the_same(tmp_path, monkeypatch):
     flush = os.fsync
 
@@ -497,8 +589,13 @@ def test_a_commit_is_only_that_of_the_checkout_that_the_library_lies_in(tmp_path
         pytest.skip("this is no checkout that git reads")
     subprocess.run(["git", "init", "-q", tmp_path], check=True)
     who = ["-c", "user.name=somebody", "-c", "user.email=somebody@example.org"]
-    subprocess.run(["git", "-C", tmp_path, *who, "commit", "-q", "--allow-empty", "-m", "Begin a thesis"], check=True)
-    monkeypatch.setattr("stad_lab.training.pipeline.__file__", str(shutil.copy(pipeline.__file__, tmp_path)))
+    subprocess.run(
+        ["git", "-C", tmp_path, *who, "commit", "-q", "--allow-empty", "-m", "Begin a thesis"],
+        check=True,
+    )
+    monkeypatch.setattr(
+        "stad_lab.training.pipeline.__file__", str(shutil.copy(pipeline.__file__, tmp_path))
+    )
     found = provenance("there")
     assert found["commit"] is None and found["uncommitted_changes"] is None
 
@@ -531,9 +628,13 @@ def test_verify_finds_a_return_that_no_drive_gives(quick_run, tmp_path, in_this_
     log["generations"][log["best"]["generation"] - 1]["validation"]["returns"][0] += 0.001
     save_json(folder / "evolution.json", log)
     assert main(["verify", str(folder)]) == 1
-    assert re.search(r"drives +FAILED: the record says \[.*\], now it was \[", capsys.readouterr().out)
+    assert re.search(
+        r"drives +FAILED: the record says \[.*\], now it was \[", capsys.readouterr().out
+    )
     record = load_json(folder / "record.json")
-    record["continued_with"] = [record["made_with"] | {"processor": "a processor with other last bits"}]
+    record["continued_with"] = [
+        record["made_with"] | {"processor": "a processor with other last bits"}
+    ]
     save_json(folder / "record.json", record)
     drives = verify(folder, in_this_process)["drives"]
     assert re.match(r"differs: .*; but processor is '.*' and was 'a processor with", drives)
@@ -561,23 +662,36 @@ def test_verify_tells_of_a_controller_that_the_log_does_not_know_beside_all_that
 
 
 @pytest.mark.parametrize(
-    ("name", "part"), [("autoencoder.safetensors", "V"), ("mdn_rnn.safetensors", "M"), ("rollouts", "V")]
+    ("name", "part"),
+    [("autoencoder.safetensors", "V"), ("mdn_rnn.safetensors", "M"), ("rollouts", "V")],
 )
-def test_verify_tells_of_a_part_of_another_run_on_its_own_line(name, part, whole, another, tmp_path, in_this_process):
+def test_verify_tells_of_a_part_of_another_run_on_its_own_line(
+    name, part, whole, another, tmp_path, in_this_process
+):
     folder = shutil.copytree(whole, tmp_path / "run", ignore=shutil.ignore_patterns(name))
     copy = shutil.copytree if name == "rollouts" else shutil.copy
     copy(another / name, folder / name)
     assert verify(folder, in_this_process)[part].startswith("FAILED")
 
 
-def test_weights_without_a_log_or_an_evaluation_have_no_drives_to_verify(quick_run, tmp_path, in_this_process):
-    run = shutil.copytree(quick_run, tmp_path / "run", ignore=shutil.ignore_patterns("evolution.json", "rollouts"))
+def test_weights_without_a_log_or_an_evaluation_have_no_drives_to_verify(
+    quick_run, tmp_path, in_this_process
+):
+    run = shutil.copytree(
+        quick_run, tmp_path / "run", ignore=shutil.ignore_patterns("evolution.json", "rollouts")
+    )
     found = verify(run, in_this_process)
-    assert {name for name, outcome in found.items() if outcome.startswith("none")} >= {"log of CMA-ES", "C", "drives"}
+    assert {name for name, outcome in found.items() if outcome.startswith("none")} >= {
+        "log of CMA-ES",
+        "C",
+        "drives",
+    }
     assert not [outcome for outcome in found.values() if outcome.startswith("FAILED")]
 
 
-def test_a_longer_run_that_was_killed_on_its_way_is_well_and_not_at_its_end(quick_run, tmp_path, in_this_process):
+def test_a_longer_run_that_was_killed_on_its_way_is_well_and_not_at_its_end(
+    quick_run, tmp_path, in_this_process
+):
     run = shutil.copytree(quick_run, tmp_path / "run")
     longer = dataclasses.replace(SETTINGS, generations=8)
 
@@ -610,13 +724,19 @@ def test_a_run_that_has_lost_v_or_m_fails(lost, whole, tmp_path, in_this_process
 
 def test_a_driver_s_record_is_no_run_to_go_on_with(tmp_path):
     shutil.copy(RECORDS / "random_driver" / "seed0" / "record.json", tmp_path)
-    with pytest.raises(ValueError, match="holds the record of random_driver, which is no run: choose another folder"):
+    with pytest.raises(
+        ValueError,
+        match="holds the record of random_driver, which is no run: choose another folder",
+    ):
         train(VARIANT, SETTINGS, tmp_path)
 
 
 def test_verify_says_of_a_driver_without_an_agent_that_there_is_nothing_to_verify(capsys):
     assert main(["verify", str(RECORDS / "random_driver" / "seed0")]) == 2
-    assert "random_driver, which has no V, M and C: there is nothing to verify" in capsys.readouterr().err
+    assert (
+        "random_driver, which has no V, M and C: there is nothing to verify"
+        in capsys.readouterr().err
+    )
 
 
 # Security
@@ -626,7 +746,13 @@ def test_a_run_uses_no_network_and_writes_only_into_its_folder(quick_training):
     folder, process, _ = quick_training  # which the guard of conftest.py has watched
     assert "guarded" in process.stderr
     assert "forbidden" not in process.stderr
-    names = {"rollouts", "autoencoder.safetensors", "mdn_rnn.safetensors", "evolution.json", "controller.safetensors"}
+    names = {
+        "rollouts",
+        "autoencoder.safetensors",
+        "mdn_rnn.safetensors",
+        "evolution.json",
+        "controller.safetensors",
+    }
     assert {path.name for path in folder.iterdir()} == names | {"record.json", ".lock"}
 
 
@@ -644,7 +770,13 @@ def test_the_time_of_a_stage_is_that_of_all_its_starts(tmp_path, in_this_process
             raise KeyboardInterrupt
         return True
 
-    asked = {"mdn_rnn": stage}, ["mdn_rnn"], {"settings": SETTINGS.as_dict(), "seconds": {}}, tmp_path, None
+    asked = (
+        {"mdn_rnn": stage},
+        ["mdn_rnn"],
+        {"settings": SETTINGS.as_dict(), "seconds": {}},
+        tmp_path,
+        None,
+    )
     with pytest.raises(KeyboardInterrupt):
         pipeline.run_stages(*asked, in_this_process)
     assert load_json(tmp_path / "record.json")["seconds"]["mdn_rnn"] >= 0.05

@@ -40,7 +40,9 @@ def tell_parent():
     return os.getppid(), "stad_lab.training.pipeline" in sys.modules
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere workers import what they need themselves")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="elsewhere workers import what they need themselves"
+)
 def test_the_workers_of_all_pools_come_from_one_process_that_has_imported_the_library():
     parents = []
     for _ in range(2):
@@ -55,11 +57,18 @@ def test_the_workers_of_all_pools_come_from_one_process_that_has_imported_the_li
 
 def test_a_script_that_its_workers_read_again_learns_the_remedy(tmp_path):
     script, call = tmp_path / "script.py", "train('input', Settings.preset('quick'), 'run')"
-    script.write_text(f"from stad_lab import Settings\nfrom stad_lab.training.pipeline import train\n{call}\n")
+    script.write_text(
+        f"from stad_lab import Settings\nfrom stad_lab.training.pipeline import train\n{call}\n"
+    )
     command = [sys.executable, "-W", "ignore", script]
-    process = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    process = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False
+    )
     assert process.returncode != 0
-    assert 'below a line `if __name__ == "__main__":`' in process.stderr and "in use by another" not in process.stderr
+    assert (
+        'below a line `if __name__ == "__main__":`' in process.stderr
+        and "in use by another" not in process.stderr
+    )
 
 
 def test_whoever_evaluates_in_a_worker_that_is_just_starting_learns_the_remedy(monkeypatch):
@@ -168,7 +177,9 @@ def test_an_interrupt_while_a_worker_sends_its_result_does_not_hang():
 
 @pytest.mark.skipif(not has_glibc(), reason="only glibc is told to keep memory")
 def test_freed_memory_is_kept_and_returned_when_the_process_holds_too_much():
-    process = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, timeout=60)
+    process = subprocess.run(
+        [sys.executable, "-c", FREED], capture_output=True, text=True, timeout=60
+    )
     assert process.returncode == 0, process.stderr
     kept, still, returned = map(float, process.stdout.split())
     assert kept > 350

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from stad_lab.models.controller import check_parameters, control, initial_parameters, parameter_count
+from stad_lab.models.controller import (
+    check_parameters,
+    control,
+    initial_parameters,
+    parameter_count,
+)
 
 
 def random_parameters(cars, scale=1.0):
@@ -59,7 +64,8 @@ def test_an_action_that_is_not_finite_is_refused(bad):
     parameters = random_parameters(1)[0]
     parameters[:40] = 0
     with pytest.raises(
-        ValueError, match=r"action \[.*nan.*\] before squashing, expected finite numbers: check z, h and C"
+        ValueError,
+        match=r"action \[.*nan.*\] before squashing, expected finite numbers: check z, h and C",
     ):
         control(parameters, features)
 
@@ -69,11 +75,14 @@ def test_parameters_that_are_not_finite_are_refused(bad):
     parameters = random_parameters(1)[0]
     parameters[5] = bad
     with pytest.raises(
-        ValueError, match=r"here.safetensors: parameters that are not finite.*evolve the controller again"
+        ValueError,
+        match=r"here.safetensors: parameters that are not finite.*evolve the controller again",
     ):
         check_parameters(parameters, len(parameters), "here.safetensors")
 
 
 def test_parameters_of_another_size_are_refused():
-    with pytest.raises(ValueError, match=r"shape \(123,\), expected \(867,\) or \(cars, 867\).*another size"):
+    with pytest.raises(
+        ValueError, match=r"shape \(123,\), expected \(867,\) or \(cars, 867\).*another size"
+    ):
         check_parameters(random_parameters(1)[0], 867)

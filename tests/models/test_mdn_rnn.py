@@ -40,7 +40,9 @@ def make_mixture(batch=2, time=5, latent_size=4, mixtures=3):
 def make_sequence(batch=2, time=6, latent_size=4):
     """Latents and actions."""
     generator = torch.Generator().manual_seed(2)
-    return torch.randn(batch, time, latent_size, generator=generator), torch.rand(batch, time, 3, generator=generator)
+    return torch.randn(batch, time, latent_size, generator=generator), torch.rand(
+        batch, time, 3, generator=generator
+    )
 
 
 def test_the_loss_is_that_of_torch_distributions():
@@ -54,10 +56,14 @@ def test_the_loss_is_that_of_torch_distributions():
 def test_the_loss_of_one_gaussian_is_the_closed_form():
     mean, sigma, target = 0.3, 0.05, 0.36
     shape = (1, 1, 1, 1)
-    mixture = Mixture(torch.zeros(shape), torch.full(shape, mean), torch.full(shape, math.log(sigma)))
+    mixture = Mixture(
+        torch.zeros(shape), torch.full(shape, mean), torch.full(shape, math.log(sigma))
+    )
     expected = 0.5 * math.log(2 * math.pi) + math.log(sigma) + (target - mean) ** 2 / (2 * sigma**2)
     assert expected < 0  # a density: the loss can honestly be negative
-    assert mdn_loss(mixture, torch.full((1, 1, 1), target)).item() == pytest.approx(expected, rel=1e-4)
+    assert mdn_loss(mixture, torch.full((1, 1, 1), target)).item() == pytest.approx(
+        expected, rel=1e-4
+    )
 
 
 def test_targets_far_away_give_finite_losses_and_gradients():
@@ -85,7 +91,9 @@ def test_predictions_and_losses_stay_on_one_device():
     mixture, state = mdn_rnn(latents, actions)
     mdn_loss(mixture, latents).backward()
     _, state = mdn_rnn.remember(latents[:, :1], actions[:, :1], state)
-    assert {part.device.type for part in (*mixture, *state, *(p.grad for p in mdn_rnn.parameters()))} == {"meta"}
+    assert {
+        part.device.type for part in (*mixture, *state, *(p.grad for p in mdn_rnn.parameters()))
+    } == {"meta"}
 
 
 def test_a_sequence_equals_repeated_single_steps():
@@ -140,7 +148,11 @@ def test_samples_at_a_low_temperature_shrink_to_the_likeliest_mean():
 def test_at_a_high_temperature_unlikely_gaussians_are_drawn_more_often_and_all_are_wider():
     weights = torch.tensor([0.8, 0.15, 0.05])
     shape = (1, 30_000, 1, 3)
-    mixture = Mixture(weights.log().expand(shape), torch.tensor([-10.0, 0.0, 10.0]).expand(shape), torch.zeros(shape))
+    mixture = Mixture(
+        weights.log().expand(shape),
+        torch.tensor([-10.0, 0.0, 10.0]).expand(shape),
+        torch.zeros(shape),
+    )
     drawn = sample_mixture(mixture, 4.0, torch.Generator().manual_seed(0)).flatten()
     nearest = ((drawn + 15) / 10).floor().clamp(0, 2)
     shares = torch.bincount(nearest.long()) / len(drawn)
@@ -150,7 +162,10 @@ def test_at_a_high_temperature_unlikely_gaussians_are_drawn_more_often_and_all_a
 
 def test_samples_repeat_with_the_generator_and_leave_torch_s_own_alone():
     state = torch.get_rng_state()
-    draws = [sample_mixture(make_mixture(), 1.0, torch.Generator().manual_seed(seed)) for seed in (3, 3, 4)]
+    draws = [
+        sample_mixture(make_mixture(), 1.0, torch.Generator().manual_seed(seed))
+        for seed in (3, 3, 4)
+    ]
     assert torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
     assert torch.equal(torch.get_rng_state(), state)
@@ -159,53 +174,78 @@ def test_samples_repeat_with_the_generator_and_leave_torch_s_own_alone():
 @pytest.mark.parametrize("temperature", [0, -1.0, float("nan"), float("inf")])
 def test_a_temperature_that_is_no_positive_number_is_refused(temperature):
     with pytest.raises(
-        ValueError, match=f"temperature={temperature}: expected a .*number above 0, from 1e-6 on; 1 is what M"
+        ValueError,
+        match=f"temperature={temperature}: expected a .*number above 0, from 1e-6 on; 1 is what M",
     ):
         sample_mixture(make_mixture(), temperature)
 
 
 def test_sequences_are_stretches_of_one_episode_with_z_drawn_anew():
     lengths, latent_size = (9, 30, 12), 2
-    encoded = [np.full((2, length, latent_size), -30.0, np.float32) for length in lengths]  # hardly any noise
+    encoded = [
+        np.full((2, length, latent_size), -30.0, np.float32) for length in lengths
+    ]  # hardly any noise
     actions = []
     for index, length in enumerate(lengths):
         encoded[index][0] = (100 * index + np.arange(length))[:, None]
-        actions.append(np.repeat((100 * index + np.arange(length))[:, None], 3, 1).astype(np.float32))
+        actions.append(
+            np.repeat((100 * index + np.arange(length))[:, None], 3, 1).astype(np.float32)
+        )
     latents, chosen = sequence_batch(encoded, actions, 10, 200, np.random.default_rng(0))
     assert latents.shape == (200, 11, 2)
     assert chosen.shape == (200, 10, 3)
     assert torch.equal(latents[:, :-1, 0].round(), chosen[:, :, 0])  # actions belong to their z
     assert ((latents[:, 1:] - latents[:, :-1]).round() == 1).all()  # in order, within one episode
     starts = set(latents[:, 0, 0].round().int().tolist())
-    assert starts == {*range(100, 120), 200, 201}  # every stretch that fits, none of the short episode
+    assert starts == {
+        *range(100, 120),
+        200,
+        201,
+    }  # every stretch that fits, none of the short episode
     encoded[1][1] = encoded[2][1] = 0  # deviation 1
-    noisy = [sequence_batch(encoded, actions, 10, 50, np.random.default_rng(seed))[0] for seed in (0, 0, 1)]
+    noisy = [
+        sequence_batch(encoded, actions, 10, 50, np.random.default_rng(seed))[0]
+        for seed in (0, 0, 1)
+    ]
     assert torch.equal(noisy[0], noisy[1])
     assert not torch.equal(noisy[0], noisy[2])
     assert (
-        noisy[0][:, :-1, 0] - sequence_batch(encoded, actions, 10, 50, np.random.default_rng(0))[1][..., 0]
+        noisy[0][:, :-1, 0]
+        - sequence_batch(encoded, actions, 10, 50, np.random.default_rng(0))[1][..., 0]
     ).std() > 0.8
 
 
 def test_sequences_longer_than_every_episode_are_refused():
     encoded = [np.zeros((2, 20, 2), np.float32)]
-    with pytest.raises(ValueError, match="m_sequence=20, but the longest episode has 20 frames: use shorter sequences"):
+    with pytest.raises(
+        ValueError,
+        match="m_sequence=20, but the longest episode has 20 frames: use shorter sequences",
+    ):
         sequence_batch(encoded, [np.zeros((20, 3), np.float32)], 20, 1, np.random.default_rng(0))
 
 
 @pytest.mark.parametrize(("lengths", "which"), [((30, 10), "held-out"), ((10, 30), "training")])
-def test_a_training_without_a_sequence_for_both_losses_is_refused_before_it_begins(lengths, which, tmp_path):
+def test_a_training_without_a_sequence_for_both_losses_is_refused_before_it_begins(
+    lengths, which, tmp_path
+):
     encoded, actions = (
         [np.zeros((2, n, 4), np.float32) for n in lengths],
         [np.zeros((n, 3), np.float32) for n in lengths],
     )
     episode = np.repeat([0, 1], lengths)
     rollouts = SimpleNamespace(
-        episode=episode, identity="two", split=lambda: (np.flatnonzero(episode == 0), np.flatnonzero(episode == 1))
+        episode=episode,
+        identity="two",
+        split=lambda: (np.flatnonzero(episode == 0), np.flatnonzero(episode == 1)),
     )
     settings = Settings.preset("quick", m_sequence=20)
-    with pytest.raises(ValueError, match=f"m_sequence=20, but the longest {which} episode has 10 frames: use shorter"):
-        fit_mdn_rnn(tmp_path / "m", make_mdn_rnn(), "input", "v", encoded, actions, rollouts, settings)
+    with pytest.raises(
+        ValueError,
+        match=f"m_sequence=20, but the longest {which} episode has 10 frames: use shorter",
+    ):
+        fit_mdn_rnn(
+            tmp_path / "m", make_mdn_rnn(), "input", "v", encoded, actions, rollouts, settings
+        )
     assert not list(tmp_path.iterdir())
 
 
@@ -213,14 +253,19 @@ def fit_made_up(path, heldout=0.0):
     """Train an M on made-up drives, in which the next z is the sign of the steering, and held-out ones that differ."""
     rng = np.random.default_rng(0)
     actions = [rng.choice([-1.0, 1.0], (40, 3)).astype(np.float32) for _ in range(12)]
-    z = [np.concatenate([np.zeros((1, 4)), np.repeat(action[:-1, :1], 4, axis=1)]) for action in actions]
+    z = [
+        np.concatenate([np.zeros((1, 4)), np.repeat(action[:-1, :1], 4, axis=1)])
+        for action in actions
+    ]
     encoded = [np.stack([one, np.full((40, 4), -8.0)]).astype(np.float32) for one in z]
     encoded[-1][0] += heldout
     episode = np.repeat(np.arange(12), 40)
     parts = np.flatnonzero(episode < 11), np.flatnonzero(episode == 11)
     rollouts = SimpleNamespace(episode=episode, identity=f"made up {heldout}", split=lambda: parts)
     settings = Settings.preset("quick", m_sequence=20, m_steps=60, m_learning_rate=2e-2)
-    fit_mdn_rnn(path, make_mdn_rnn(hidden_size=16), "input", "v", encoded, actions, rollouts, settings)
+    fit_mdn_rnn(
+        path, make_mdn_rnn(hidden_size=16), "input", "v", encoded, actions, rollouts, settings
+    )
     return *load_mdn_rnn(path), actions[-1], encoded[-1][0]
 
 
@@ -235,8 +280,14 @@ def test_m_does_not_learn_from_held_out_episodes(tmp_path):
     (one, told, *_), (other, told_otherwise, *_) = (
         fit_made_up(tmp_path / f"{heldout}.safetensors", heldout) for heldout in (0.0, 5.0)
     )
-    assert all(torch.equal(a, b) for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True))
-    assert told_otherwise["history"][-1]["heldout"]["total"] > told["history"][-1]["heldout"]["total"] + 1
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True)
+    )
+    assert (
+        told_otherwise["history"][-1]["heldout"]["total"]
+        > told["history"][-1]["heldout"]["total"] + 1
+    )
 
 
 def test_training_lowers_the_held_out_loss(quick_run):
@@ -248,17 +299,23 @@ def test_training_lowers_the_held_out_loss(quick_run):
 def test_no_steps_leave_an_m_with_the_weights_that_it_began_with(quick_run, tmp_path, monkeypatch):
     settings = Settings.preset("quick", m_steps=0)
     shutil.copy(quick_run / "autoencoder.safetensors", tmp_path)
-    monkeypatch.setattr("stad_lab.models.mdn_rnn.encode_frames", None)  # for no step V need not look at an episode
+    monkeypatch.setattr(
+        "stad_lab.models.mdn_rnn.encode_frames", None
+    )  # for no step V need not look at an episode
     assert train_mdn_rnn("input_output", settings, quick_run / "rollouts", tmp_path)
     assert not train_mdn_rnn("input_output", settings, quick_run / "rollouts", tmp_path)
     untrained, facts = load_mdn_rnn(tmp_path / "mdn_rnn.safetensors", "input_output")
     torch.manual_seed(settings.seed)
     fresh = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
     assert facts["history"] == []
-    assert all(untrained.state_dict()[name].equal(weights) for name, weights in fresh.state_dict().items())
+    assert all(
+        untrained.state_dict()[name].equal(weights) for name, weights in fresh.state_dict().items()
+    )
 
 
-def test_an_interrupted_training_equals_an_uninterrupted_one_bit_for_bit(quick_run, tmp_path, interrupt_after):
+def test_an_interrupted_training_equals_an_uninterrupted_one_bit_for_bit(
+    quick_run, tmp_path, interrupt_after
+):
     settings = Settings.preset("quick", m_steps=60)
     files = []
     for folder in (tmp_path / "one_go", tmp_path / "interrupted"):
@@ -297,7 +354,9 @@ def test_saved_weights_are_loaded_to_the_same_predictions(tmp_path):
 
 def test_weights_for_another_variant_are_refused(tmp_path):
     save_mdn_rnn(tmp_path / "m.safetensors", make_mdn_rnn(), "input", Settings(), [])
-    with pytest.raises(ValueError, match="holds variant 'input', and 'frame' was asked for: give its own run"):
+    with pytest.raises(
+        ValueError, match="holds variant 'input', and 'frame' was asked for: give its own run"
+    ):
         load_mdn_rnn(tmp_path / "m.safetensors", "frame")
 
 
@@ -308,9 +367,13 @@ def test_weights_of_another_part_are_refused(quick_run):
 
 def test_every_step_of_m_sees_other_sequences(tmp_path, monkeypatch):
     drawn, own = [], room.sequence_batch
-    monkeypatch.setattr(room, "sequence_batch", lambda *given: drawn.append(own(*given)) or drawn[-1])
+    monkeypatch.setattr(
+        room, "sequence_batch", lambda *given: drawn.append(own(*given)) or drawn[-1]
+    )
     fit_made_up(tmp_path / "m.safetensors")
-    batches = [z for z, _ in drawn if len(z) == Settings.preset("quick").m_batch]  # the held-out ones are larger
+    batches = [
+        z for z, _ in drawn if len(z) == Settings.preset("quick").m_batch
+    ]  # the held-out ones are larger
     assert len(batches) == len({z.numpy().tobytes() for z in batches}) == 60
 
 
@@ -321,5 +384,7 @@ def test_a_training_state_of_m_names_its_v_and_its_rollouts(tmp_path, monkeypatc
     for v, seen in (("v", "one"), ("another", "one"), ("v", "other")):
         rollouts = SimpleNamespace(episode=episode, identity=seen, split=lambda: parts)
         settings = Settings.preset("quick", m_steps=0)
-        fit_mdn_rnn(tmp_path / "m.safetensors", make_mdn_rnn(), "input", v, [], [], rollouts, settings)
+        fit_mdn_rnn(
+            tmp_path / "m.safetensors", make_mdn_rnn(), "input", v, [], [], rollouts, settings
+        )
     assert told[0] not in told[1:]

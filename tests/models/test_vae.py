@@ -34,7 +34,9 @@ def make_batch(count=3, seed=0):
     """Frames, difference images and noise."""
     rng = np.random.default_rng(seed)
     frames, earlier = rng.integers(0, 256, (2, count, 64, 64, 3), np.uint8)
-    return *to_pictures(frames, earlier), torch.from_numpy(rng.standard_normal((count, 32), np.float32))
+    return *to_pictures(frames, earlier), torch.from_numpy(
+        rng.standard_normal((count, 32), np.float32)
+    )
 
 
 @pytest.mark.parametrize(
@@ -47,7 +49,10 @@ def make_batch(count=3, seed=0):
 def test_the_decoder_s_own_layers_are_transposed_convolutions(ours, general, size, drawn):
     torch.manual_seed(0)
     general.load_state_dict(ours.state_dict())
-    pictures, wanted = torch.randn(3, 8, size, size), torch.randn(3, ours.out_channels, drawn, drawn)
+    pictures, wanted = (
+        torch.randn(3, 8, size, size),
+        torch.randn(3, ours.out_channels, drawn, drawn),
+    )
     results = []
     for layer in (ours, general):
         seen = pictures.clone().requires_grad_()
@@ -64,7 +69,9 @@ def test_pictures_weights_and_losses_stay_on_one_device(variant):
     autoencoder = make_autoencoder(variant).to("meta", memory_format=torch.channels_last)
     frames = np.zeros((3, 64, 64, 3), np.uint8)
     frame, difference = to_pictures(frames, frames, "meta")
-    losses = autoencoder_losses(autoencoder, frame, difference, torch.zeros(3, 32, device="meta"), Settings())
+    losses = autoencoder_losses(
+        autoencoder, frame, difference, torch.zeros(3, 32, device="meta"), Settings()
+    )
     losses["total"].backward()
     assert {loss.device.type for loss in losses.values()} == {"meta"}
     assert {parameter.grad.device.type for parameter in autoencoder.parameters()} == {"meta"}
@@ -72,13 +79,16 @@ def test_pictures_weights_and_losses_stay_on_one_device(variant):
 
 def test_frames_that_are_no_bytes_are_refused_and_stay_what_they_are():
     frames = np.full((2, 64, 64, 3), 255, np.float32)
-    with pytest.raises(ValueError, match=r"\(2, 64, 64, 3\) float32 .*: expected two uint8 arrays of one shape"):
+    with pytest.raises(
+        ValueError, match=r"\(2, 64, 64, 3\) float32 .*: expected two uint8 arrays of one shape"
+    ):
         to_pictures(frames, frames)
     assert (frames == 255).all()
 
 
 @pytest.mark.parametrize(
-    ("variant", "seen", "redrawn"), [("frame", 3, 3), ("input", 6, 3), ("output", 3, 6), ("input_output", 6, 6)]
+    ("variant", "seen", "redrawn"),
+    [("frame", 3, 3), ("input", 6, 3), ("output", 3, 6), ("input_output", 6, 6)],
 )
 def test_each_variant_sees_and_redraws_its_pictures(variant, seen, redrawn):
     autoencoder = make_autoencoder(variant)
@@ -104,7 +114,9 @@ def test_the_four_variants_are_those_of_the_paper():
 
 
 def test_an_unknown_variant_is_refused_with_the_choices():
-    with pytest.raises(ValueError, match="unknown variant 'both': choose one of frame, input, output, input_output"):
+    with pytest.raises(
+        ValueError, match="unknown variant 'both': choose one of frame, input, output, input_output"
+    ):
         AutoEncoder("both")
 
 
@@ -132,7 +144,11 @@ def test_kl_is_that_of_torch_distributions():
     frame, difference, noise = make_batch()
     mu, logvar = autoencoder.encode(frame, difference)
     normal = torch.distributions.Normal
-    expected = torch.distributions.kl_divergence(normal(mu, torch.exp(logvar / 2)), normal(0.0, 1.0)).sum(1).mean()
+    expected = (
+        torch.distributions.kl_divergence(normal(mu, torch.exp(logvar / 2)), normal(0.0, 1.0))
+        .sum(1)
+        .mean()
+    )
     kl = autoencoder_losses(autoencoder, frame, difference, noise, Settings())["kl"]
     assert kl > 1
     assert torch.allclose(kl, expected, rtol=1e-4)
@@ -142,13 +158,21 @@ def test_kl_is_that_of_torch_distributions():
 @pytest.mark.parametrize("floor", ["none", "above some pictures and below others"])
 def test_the_loss_is_the_plain_sum_of_its_named_terms(variant, floor):
     autoencoder = make_autoencoder(variant)
-    autoencoder.encoder[-1].weight.data *= 100  # some 60 nats of KL, so that each nat counts in the total
+    autoencoder.encoder[
+        -1
+    ].weight.data *= 100  # some 60 nats of KL, so that each nat counts in the total
     autoencoder.decoder[0].weight.data *= 30  # and z in the drawing
     frame, difference, noise = make_batch()
     mu, logvar = (part.detach().double().numpy() for part in autoencoder.encode(frame, difference))
     z = mu + np.sqrt(np.exp(logvar)) * noise.numpy()
-    drawn = [None if d is None else d.detach().numpy() for d in autoencoder.decode(torch.from_numpy(z).float())]
-    kl = [sum(0.5 * (m**2 + np.exp(v) - 1 - v) for m, v in zip(*row, strict=True)) for row in zip(mu, logvar)]  # noqa: B905
+    drawn = [
+        None if d is None else d.detach().numpy()
+        for d in autoencoder.decode(torch.from_numpy(z).float())
+    ]
+    kl = [
+        sum(0.5 * (m**2 + np.exp(v) - 1 - v) for m, v in zip(*row, strict=True))
+        for row in zip(mu, logvar)
+    ]
     free_bits = 0.0 if floor == "none" else float(np.median(kl)) / 32
     settings = Settings(kl_weight=0.7, difference_weight=3.0, free_bits=free_bits)
     losses = autoencoder_losses(autoencoder, frame, difference, noise, settings)
@@ -178,7 +202,9 @@ def test_the_noise_is_reparameterised():
     autoencoder = make_autoencoder("frame")
     frame, difference, noise = make_batch()
     settings = Settings(kl_weight=0.0)
-    silent = autoencoder_losses(autoencoder, frame, difference, torch.zeros_like(noise), settings)["total"]
+    silent = autoencoder_losses(autoencoder, frame, difference, torch.zeros_like(noise), settings)[
+        "total"
+    ]
     redrawn = autoencoder.reconstruct(frame, difference)[0]
     assert torch.allclose(silent, ((redrawn - frame) ** 2).sum() / 3)
     noisy = autoencoder_losses(autoencoder, frame, difference, noise, settings)["total"]
@@ -193,7 +219,10 @@ def test_reconstruct_decodes_the_mean_and_repeats_itself():
     autoencoder = make_autoencoder("input_output")
     frame, difference, _ = make_batch()
     decoded = autoencoder.decode(autoencoder.encode(frame, difference)[0])
-    for redrawn in (autoencoder.reconstruct(frame, difference), autoencoder.reconstruct(frame, difference)):
+    for redrawn in (
+        autoencoder.reconstruct(frame, difference),
+        autoencoder.reconstruct(frame, difference),
+    ):
         assert torch.equal(redrawn[0], decoded[0])
         assert torch.equal(redrawn[1], decoded[1])
 
@@ -223,7 +252,9 @@ def test_v_does_not_learn_from_held_out_episodes(quick_run, tmp_path):
     assert losses[1] > 2 * losses[0]
 
 
-def test_a_training_interrupted_twice_equals_an_uninterrupted_one_bit_for_bit(quick_run, tmp_path, interrupt_after):
+def test_a_training_interrupted_twice_equals_an_uninterrupted_one_bit_for_bit(
+    quick_run, tmp_path, interrupt_after
+):
     settings = Settings.preset("quick", width=4)
     for updates in (1, 17):  # before the first checkpoint, and between two of them
         hook = interrupt_after(updates)
@@ -238,12 +269,19 @@ def test_a_training_interrupted_twice_equals_an_uninterrupted_one_bit_for_bit(qu
     assert all(torch.equal(one_go[name], resumed[name]) for name in one_go | resumed)
     assert one_go_facts == resumed_facts
     assert files[0].read_bytes() == files[1].read_bytes()
-    assert [file.name for file in files[1].parent.glob("[!.]*")] == ["autoencoder.safetensors"]  # no checkpoint is left
+    assert [file.name for file in files[1].parent.glob("[!.]*")] == [
+        "autoencoder.safetensors"
+    ]  # no checkpoint is left
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(quick_run, tmp_path):
-    settings = Settings.preset("quick", width=4, difference_weight=1e12, kl_weight=1e12, v_learning_rate=1e6)
-    with pytest.raises(FloatingPointError, match=r"train V .output.: the loss is .* in step .*lower the learning rate"):
+    settings = Settings.preset(
+        "quick", width=4, difference_weight=1e12, kl_weight=1e12, v_learning_rate=1e6
+    )
+    with pytest.raises(
+        FloatingPointError,
+        match=r"train V .output.: the loss is .* in step .*lower the learning rate",
+    ):
         train_autoencoder("output", settings, quick_run / "rollouts", tmp_path)
 
 
@@ -251,16 +289,28 @@ def test_v_and_m_of_other_rollouts_are_refused(quick_run, tmp_path):
     manifest = load_json(quick_run / "rollouts" / "manifest.json")
     save_json(tmp_path / "manifest.json", manifest | {"blocks": manifest["blocks"][::-1]})
     for train in (train_autoencoder, train_mdn_rnn):
-        with pytest.raises(ValueError, match=r".safetensors was trained on other rollouts than those in"):
+        with pytest.raises(
+            ValueError, match=r".safetensors was trained on other rollouts than those in"
+        ):
             train("input_output", Settings.preset("quick"), tmp_path, quick_run)
 
 
 def test_v_and_m_of_other_settings_are_refused(quick_run, tmp_path):
-    changes = ("autoencoder", train_autoencoder, "kl_weight", 16.0), ("mdn_rnn", train_mdn_rnn, "m_learning_rate", 0.5)
+    changes = (
+        ("autoencoder", train_autoencoder, "kl_weight", 16.0),
+        ("mdn_rnn", train_mdn_rnn, "m_learning_rate", 0.5),
+    )
     for part, train, name, value in changes:
         shutil.copy(quick_run / f"{part}.safetensors", tmp_path)
-        with pytest.raises(ValueError, match=rf"{part}.safetensors holds a run with {name}=.*now {name}={value}"):
-            train("input_output", Settings.preset("quick", **{name: value}), quick_run / "rollouts", tmp_path)
+        with pytest.raises(
+            ValueError, match=rf"{part}.safetensors holds a run with {name}=.*now {name}={value}"
+        ):
+            train(
+                "input_output",
+                Settings.preset("quick", **{name: value}),
+                quick_run / "rollouts",
+                tmp_path,
+            )
 
 
 def test_a_training_state_that_a_killed_process_left_behind_is_cleared_away(quick_run, tmp_path):
@@ -274,15 +324,22 @@ def test_a_training_state_that_a_killed_process_left_behind_is_cleared_away(quic
 
 def test_saved_weights_are_loaded_to_the_same_pictures(tmp_path):
     autoencoder = make_autoencoder("input_output")
-    save_autoencoder(tmp_path / "v.safetensors", autoencoder, Settings(stride=3, crop_bar=False), [])
+    save_autoencoder(
+        tmp_path / "v.safetensors", autoencoder, Settings(stride=3, crop_bar=False), []
+    )
     loaded, facts = load_autoencoder(tmp_path / "v.safetensors", "input_output")
     frame, difference, _ = make_batch()
-    assert torch.allclose(loaded.reconstruct(frame, difference)[1], autoencoder.reconstruct(frame, difference)[1])
+    assert torch.allclose(
+        loaded.reconstruct(frame, difference)[1], autoencoder.reconstruct(frame, difference)[1]
+    )
     assert (facts["stride"], facts["crop_bar"], facts["width"]) == (3, False, 4)
 
 
 def test_weights_of_another_variant_are_refused(quick_run):
-    with pytest.raises(ValueError, match="holds variant 'input_output', and 'frame' was asked for: give its own run"):
+    with pytest.raises(
+        ValueError,
+        match="holds variant 'input_output', and 'frame' was asked for: give its own run",
+    ):
         load_autoencoder(quick_run / "autoencoder.safetensors", "frame")
 
 
@@ -295,7 +352,10 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
     autoencoder = make_autoencoder("frame")
     autoencoder.encoder[0].bias.data[1] = float("nan")
     save_autoencoder(tmp_path / "v.safetensors", autoencoder, Settings(), [])
-    with pytest.raises(ValueError, match=r"v.safetensors holds values that are not finite in 'encoder.0.bias': train"):
+    with pytest.raises(
+        ValueError,
+        match=r"v.safetensors holds values that are not finite in 'encoder.0.bias': train",
+    ):
         load_autoencoder(tmp_path / "v.safetensors")
 
 

@@ -39,7 +39,9 @@ def key(kind, code, **more):
 
 def loops():
     """How many cars drive in this process."""
-    return sum(isinstance(thread, Loop) and not thread.stopped.is_set() for thread in threading.enumerate())
+    return sum(
+        isinstance(thread, Loop) and not thread.stopped.is_set() for thread in threading.enumerate()
+    )
 
 
 def test_keys_go_down_and_come_up_and_all_come_up_when_the_pointer_leaves(make_seat):
@@ -75,7 +77,10 @@ def test_the_loop_drives_and_pauses_with_keys_held_and_says_who_drives(make_seat
     wait_for(lambda: len(seat.session.rows) > driven + 3)
     assert seat.go.value and loops() == 1
     seat.on_event(key("keydown", "KeyT"))
-    assert seat.session.driver == seat.driver.value == "agent" and "The agent drives" in seat.status.value
+    assert (
+        seat.session.driver == seat.driver.value == "agent"
+        and "The agent drives" in seat.status.value
+    )
 
 
 def test_the_key_changes_drivers_after_another_cell_has_given_the_wheel(make_seat):
@@ -122,7 +127,9 @@ def test_the_loop_ends_with_the_episode_and_shows_an_error(make_seat):
     wait_for(lambda: not seat.go.value and "the episode has ended" in seat.status.value)
     seat.begin.click()
     seat.session.step = lambda: 1 / 0
-    wait_for(lambda: not seat.go.value and "ZeroDivisionError: division by zero" in seat.status.value)
+    wait_for(
+        lambda: not seat.go.value and "ZeroDivisionError: division by zero" in seat.status.value
+    )
 
 
 def test_the_car_waits_for_a_slow_browser_and_for_none_that_is_not_there(make_seat):

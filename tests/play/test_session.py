@@ -51,7 +51,9 @@ def test_the_memory_is_told_what_the_hand_did(session):
         drive(session, ("gas", 1))
     assert session.by_hand().all()
     done = np.concatenate([session.drive().actions, np.zeros((1, 3), np.float32)])
-    hidden = remember_drive(session.agent.mdn_rnn, np.array([*seen, session.agent.latents[0]]), done)
+    hidden = remember_drive(
+        session.agent.mdn_rnn, np.array([*seen, session.agent.latents[0]]), done
+    )
     assert np.allclose(session.before[0][0, 0], hidden[-1], atol=1e-5)
 
 
@@ -66,7 +68,10 @@ def test_the_dream_begins_with_the_frame_in_sight_and_the_real_car_waits_for_the
     drive(session, ("brake", 5))
     dreamt = session.dreamt()
     assert np.array_equal(dreamt.latents[0], session.agent.latents[0])
-    assert dreamt.frames.shape == (20, 64, 64, 3) and dreamt.by_hand.tolist() == [False] * 15 + [True] * 5
+    assert (
+        dreamt.frames.shape == (20, 64, 64, 3)
+        and dreamt.by_hand.tolist() == [False] * 15 + [True] * 5
+    )
     assert session.picture().shape == (64, 64, 3) and session.score == score
     session.enter("real")
     assert np.array_equal(session.picture(), before) and len(session.drive()) == 20
@@ -120,7 +125,9 @@ def test_dead_reckoning_follows_the_car(session):
     hull = session.env.unwrapped.car.hull
     moved = np.array(hull.position) - start
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    assert np.linalg.norm(driven_path(session.drive().motion)[-1] - turn @ moved) < 0.1 * np.linalg.norm(moved)
+    assert np.linalg.norm(
+        driven_path(session.drive().motion)[-1] - turn @ moved
+    ) < 0.1 * np.linalg.norm(moved)
 
 
 def test_a_dream_begins_with_m_s_memory_from_before_the_frame_in_sight(session):
@@ -129,7 +136,9 @@ def test_a_dream_begins_with_m_s_memory_from_before_the_frame_in_sight(session):
     session.enter("dream")
     assert session.hidden.any() and np.array_equal(session.hidden, session.agent.hidden[0])
     session.step()
-    done, seen = (torch.from_numpy(part)[None] for part in (session.dreamt().actions, session.agent.latents))
+    done, seen = (
+        torch.from_numpy(part)[None] for part in (session.dreamt().actions, session.agent.latents)
+    )
     with torch.no_grad():
         after, _ = session.agent.mdn_rnn.remember(seen, done, session.before)
     assert np.allclose(session.hidden, after[0, 0], atol=1e-5)
@@ -140,4 +149,6 @@ def test_a_second_episode_is_driven_as_if_it_were_the_first(session):
     drive(session, ("", 10))
     session.begin(4)
     drive(session, ("", 10))
-    assert np.array_equal(session.drive().actions, record_drive(load_agent("input"), track=4, frames=10).actions)
+    assert np.array_equal(
+        session.drive().actions, record_drive(load_agent("input"), track=4, frames=10).actions
+    )

@@ -29,7 +29,10 @@ from stad_lab.training.dataset import (
     track_seeds,
 )
 
-MANY = {"episodes": 40, "episode_frames": 30}  # a second of driving at least, so an interrupt comes in the middle
+MANY = {
+    "episodes": 40,
+    "episode_frames": 30,
+}  # a second of driving at least, so an interrupt comes in the middle
 
 
 @pytest.fixture(scope="module")
@@ -48,12 +51,23 @@ def copied(quick_run, tmp_path):
 
 def contents(folder):
     """The bytes of every file in a folder by its name; a killed process may leave hidden half-written files."""
-    return {path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith(".")}
+    return {
+        path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith(".")
+    }
 
 
 def collect_command(folder):
     """The command that collects the same episodes as `one_go`, with two processes."""
-    command = [sys.executable, "-m", "stad_lab", "train", "--variant", "frame", "--settings", "quick"]
+    command = [
+        sys.executable,
+        "-m",
+        "stad_lab",
+        "train",
+        "--variant",
+        "frame",
+        "--settings",
+        "quick",
+    ]
     command += ["--until", "rollouts", "--out", str(folder)]
     for name, value in MANY.items():
         command += ["--set", f"{name}={value}"]
@@ -66,7 +80,9 @@ def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(how
     manifest = tmp_path / "run" / "rollouts" / "manifest.json"
     process = subprocess.Popen(collect_command(tmp_path / "run"), stderr=subprocess.PIPE, text=True)
     deadline = time.time() + 120
-    while not manifest.exists() or len(json.loads(manifest.read_text(encoding="utf-8"))["blocks"]) < 3:
+    while (
+        not manifest.exists() or len(json.loads(manifest.read_text(encoding="utf-8"))["blocks"]) < 3
+    ):
         assert time.time() < deadline
         time.sleep(0.005)
     process.send_signal(getattr(signal, how))
@@ -93,7 +109,11 @@ def test_a_complete_collection_is_left_alone(copied):
 
 
 def test_what_another_process_collected_a_moment_ago_is_not_driven_again(tmp_path, monkeypatch):
-    settings, folder, lock = Settings.preset("quick", episodes=3, episode_frames=30), tmp_path / "shared", locked
+    settings, folder, lock = (
+        Settings.preset("quick", episodes=3, episode_frames=30),
+        tmp_path / "shared",
+        locked,
+    )
     written = {}
 
     def lock_late(place):
@@ -175,29 +195,39 @@ def test_reading_a_dataset_takes_little_memory_however_large_it_is(tmp_path):
     blocks = []
     for index in range(episodes):
         entry = {"index": index, "track": index, "frames": length}
-        for name, array in [("frames", np.zeros((length, 64, 64, 3), np.uint8)), ("actions", np.zeros((length, 3)))]:
+        for name, array in [
+            ("frames", np.zeros((length, 64, 64, 3), np.uint8)),
+            ("actions", np.zeros((length, 3))),
+        ]:
             path = block_path(tmp_path, index, name)
             np.save(path, array.astype(np.uint8 if name == "frames" else np.float32))
             entry[f"{name}_sha256"] = checksum(path.read_bytes())
         blocks.append(entry)
     save_json(tmp_path / "manifest.json", {"settings": {"episodes": episodes}, "blocks": blocks})
-    process = subprocess.run([sys.executable, "-c", READ_ALL, tmp_path], capture_output=True, text=True, timeout=60)
+    process = subprocess.run(
+        [sys.executable, "-c", READ_ALL, tmp_path], capture_output=True, text=True, timeout=60
+    )
     assert process.returncode == 0, process.stderr
     megabytes, grown = map(float, process.stdout.split())
     assert megabytes > 200
     assert grown < 40
 
 
-def test_a_collection_says_its_size_on_the_disk_and_starts_only_if_there_is_room(quick_training, tmp_path, monkeypatch):
+def test_a_collection_says_its_size_on_the_disk_and_starts_only_if_there_is_room(
+    quick_training, tmp_path, monkeypatch
+):
     folder, process, _ = quick_training
     assert "rollouts: up to 0.01 GB in " in process.stdout
     size = sum(file.stat().st_size for file in (folder / "rollouts").glob("*.npy"))
     assert size == pytest.approx(8 * 60 * (64 * 64 * 3 + 12), rel=0.02)
     monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=122_000_000_000))
     with pytest.raises(
-        OSError, match=r"up to 123\.00 GB in .* 122\.00 GB are free: free some room, choose a folder on another"
+        OSError,
+        match=r"up to 123\.00 GB in .* 122\.00 GB are free: free some room, choose a folder on another",
     ):
-        collect_rollouts(Settings.preset("quick", episodes=10_000, episode_frames=1000), tmp_path / "huge")
+        collect_rollouts(
+            Settings.preset("quick", episodes=10_000, episode_frames=1000), tmp_path / "huge"
+        )
     assert [file.name for file in (tmp_path / "huge").iterdir()] == [".lock"]
 
 
@@ -221,7 +251,9 @@ def test_whole_episodes_are_held_out(quick_run):
 def test_the_last_twentieth_of_the_episodes_is_held_out():
     episode = np.repeat(np.arange(40), 3)
     training, heldout = Rollouts.split(SimpleNamespace(frames=range(40), episode=episode))
-    assert training.tolist() == list(range(38 * 3)) and heldout.tolist() == list(range(38 * 3, 40 * 3))
+    assert training.tolist() == list(range(38 * 3)) and heldout.tolist() == list(
+        range(38 * 3, 40 * 3)
+    )
 
 
 def test_the_five_uses_share_no_track():
@@ -229,7 +261,11 @@ def test_the_five_uses_share_no_track():
     assert all(before[1] <= after[0] for before, after in itertools.pairwise(ranges))
     for use, (low, high) in TRACK_RANGES.items():
         assert all(low <= track < high for track in track_seeds(use, 1000, 0))
-    assert track_seeds("evolve", 4, 0, 1) != track_seeds("evolve", 4, 0, 2) != track_seeds("evolve", 4, 1, 2)
+    assert (
+        track_seeds("evolve", 4, 0, 1)
+        != track_seeds("evolve", 4, 0, 2)
+        != track_seeds("evolve", 4, 1, 2)
+    )
 
 
 def test_the_random_driver_gives_smooth_actions_within_bounds():
@@ -248,14 +284,22 @@ def test_most_episodes_start_on_their_way():
     moving = Settings.preset("quick", random_starts=1.0, episode_frames=25)
     at_rest = Settings.preset("quick", random_starts=0.0, episode_frames=25)
     for index in range(2):
-        zoomed_out, close = drive_randomly(at_rest, index)[0][0], drive_randomly(moving, index)[0][0]
-        assert (zoomed_out == 0).mean() > 0.2 > (close == 0).mean()  # the opening zoom shows the dark outside
+        zoomed_out, close = (
+            drive_randomly(at_rest, index)[0][0],
+            drive_randomly(moving, index)[0][0],
+        )
+        assert (
+            (zoomed_out == 0).mean() > 0.2 > (close == 0).mean()
+        )  # the opening zoom shows the dark outside
 
 
 @pytest.mark.parametrize("name", ["00002.frames.npy", "00005.actions.npy"])
 def test_a_missing_block_is_an_error_that_names_it(name, copied):
     (copied / name).unlink()
-    with pytest.raises(FileNotFoundError, match=f"{name} is missing although the manifest lists it: delete .* again"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=f"{name} is missing although the manifest lists it: delete .* again",
+    ):
         Rollouts(copied)
 
 
@@ -263,7 +307,8 @@ def test_a_block_cut_short_is_an_error_that_names_it(copied):
     block = copied / "00002.frames.npy"
     block.write_bytes(block.read_bytes()[:5000])
     with pytest.raises(
-        ValueError, match=r"00002.frames.npy is damaged \(5000 bytes.*checksum.*delete .* collect again"
+        ValueError,
+        match=r"00002.frames.npy is damaged \(5000 bytes.*checksum.*delete .* collect again",
     ):
         Rollouts(copied)
 
@@ -272,7 +317,9 @@ def test_a_file_cut_short_after_it_was_found_whole_gives_no_pictures(copied):
     rollouts = Rollouts(copied)
     path = sorted(copied.glob("*.frames.npy"))[-1]
     path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(ValueError, match=r"frames\.npy is shorter than it was: collect in another folder"):
+    with pytest.raises(
+        ValueError, match=r"frames\.npy is shorter than it was: collect in another folder"
+    ):
         rollouts.pairs(np.array([len(rollouts) - 1]), 4)
 
 
@@ -293,13 +340,19 @@ def test_a_damaged_manifest_is_an_error_that_names_it(copied):
 
 
 def test_a_folder_without_rollouts_is_an_error_that_names_the_command(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"manifest.json does not exist.*collect the rollouts first: python -m"):
+    with pytest.raises(
+        FileNotFoundError,
+        match=r"manifest.json does not exist.*collect the rollouts first: python -m",
+    ):
         Rollouts(tmp_path / "nowhere")
 
 
 def test_rollouts_of_other_settings_are_refused(copied):
     before = contents(copied)
-    with pytest.raises(ValueError, match=r"'episodes': 8.*'episodes': 9.*choose another folder or the same settings"):
+    with pytest.raises(
+        ValueError,
+        match=r"'episodes': 8.*'episodes': 9.*choose another folder or the same settings",
+    ):
         collect_rollouts(Settings.preset("quick", episodes=9), copied)
     assert contents(copied) == before
 

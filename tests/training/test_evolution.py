@@ -51,7 +51,9 @@ def settings(**changes):
 
 def without_evolution(run, folder):
     """A copy of a run whose controller is not evolved yet."""
-    return shutil.copytree(run, folder, ignore=shutil.ignore_patterns("evolution.json", "controller.safetensors"))
+    return shutil.copytree(
+        run, folder, ignore=shutil.ignore_patterns("evolution.json", "controller.safetensors")
+    )
 
 
 def read(folder):
@@ -84,20 +86,25 @@ def test_an_evolution_in_two_parts_equals_one_in_one_go(one_go, first_part, tmp_
     folder = shutil.copytree(first_part, tmp_path / "run")
     assert evolve("input_output", settings(processes=1), folder)
     assert read(folder) == read(one_go)
-    assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
+    assert (folder / "controller.safetensors").read_bytes() == (
+        one_go / "controller.safetensors"
+    ).read_bytes()
 
 
 def test_fewer_generations_than_there_are_is_refused_before_anything_changes(one_go):
     before = read(one_go)
     with pytest.raises(
-        ValueError, match=r"evolution.json holds 6 generations, and now generations=2 .* at least as many"
+        ValueError,
+        match=r"evolution.json holds 6 generations, and now generations=2 .* at least as many",
     ):
         evolve("input_output", settings(generations=2), one_go)
     assert read(one_go) == before
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send to a process")
-def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, quick_run, tmp_path, capsys):
+def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(
+    one_go, quick_run, tmp_path, capsys
+):
     folder = without_evolution(quick_run, tmp_path / "run")
     command = ["train", "--variant", "input_output", "--settings", "quick", "--out", str(folder)]
     command += ["--set", f"generations={GENERATIONS}", "--set", "processes=1"]
@@ -121,10 +128,14 @@ def test_an_interrupted_command_goes_on_and_equals_an_uninterrupted_one(one_go, 
     assert 1 <= len(read(folder)["generations"]) < GENERATIONS  # it was in the middle
     assert main(command) == 0
     assert read(folder) == read(one_go)
-    assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
+    assert (folder / "controller.safetensors").read_bytes() == (
+        one_go / "controller.safetensors"
+    ).read_bytes()
 
 
-def test_a_search_that_is_stopped_while_it_is_watched_goes_on_to_the_same_log(one_go, quick_run, tmp_path):
+def test_a_search_that_is_stopped_while_it_is_watched_goes_on_to_the_same_log(
+    one_go, quick_run, tmp_path
+):
     folder, seen = without_evolution(quick_run, tmp_path / "run"), []
 
     def watch(generations):
@@ -135,7 +146,9 @@ def test_a_search_that_is_stopped_while_it_is_watched_goes_on_to_the_same_log(on
     with pytest.raises(KeyboardInterrupt):
         evolve("input_output", settings(processes=1), folder, watch=watch)
     assert evolve("input_output", settings(processes=1), folder, watch=watch)
-    assert not evolve("input_output", settings(processes=1), folder, watch=watch)  # shown, not repeated
+    assert not evolve(
+        "input_output", settings(processes=1), folder, watch=watch
+    )  # shown, not repeated
     assert read(folder) == read(one_go) and seen == [1, 2, *range(2, GENERATIONS + 1), GENERATIONS]
 
 
@@ -153,10 +166,17 @@ def test_every_generation_logs_worst_average_and_best(one_go):
     for entry, (worst, average, best) in zip(generations, curves.T, strict=True):
         fitness = [sum(returns) / len(returns) for returns in entry["returns"]]
         assert len(fitness) == settings().population
-        assert (worst, average, best) == pytest.approx((min(fitness), sum(fitness) / len(fitness), max(fitness)))
-        assert all(TRACK_RANGES["evolve"][0] <= track < TRACK_RANGES["evolve"][1] for track in entry["tracks"])
+        assert (worst, average, best) == pytest.approx(
+            (min(fitness), sum(fitness) / len(fitness), max(fitness))
+        )
+        assert all(
+            TRACK_RANGES["evolve"][0] <= track < TRACK_RANGES["evolve"][1]
+            for track in entry["tracks"]
+        )
         assert 0 < entry["frames"] <= 60 * settings().population
-    assert len({entry["tracks"][0] for entry in generations}) == GENERATIONS  # new tracks every time
+    assert (
+        len({entry["tracks"][0] for entry in generations}) == GENERATIONS
+    )  # new tracks every time
     assert (curves[0] < curves[2]).any()
 
 
@@ -167,13 +187,22 @@ def test_worst_average_and_best_of_agents_on_several_tracks():
 
 def test_the_controller_is_the_averaged_mean_that_drove_the_validation_tracks_best(one_go):
     log = read(one_go)
-    looks = {entry["generation"]: entry["validation"]["mean"] for entry in log["generations"] if "validation" in entry}
+    looks = {
+        entry["generation"]: entry["validation"]["mean"]
+        for entry in log["generations"]
+        if "validation" in entry
+    }
     assert list(looks) == [2, 4, 6]
-    assert log["best"] == {"generation": max(looks, key=looks.get), "validation": max(looks.values())}
+    assert log["best"] == {
+        "generation": max(looks, key=looks.get),
+        "validation": max(looks.values()),
+    }
     start = initial_parameters(32, 24, settings().initial_gas)
     _, means = replay(start, settings(), log["generations"][: log["best"]["generation"]])
     best = averaged_mean(means, settings())
-    assert np.array_equal(load_controller(one_go / "controller.safetensors", "input_output")[0], best)
+    assert np.array_equal(
+        load_controller(one_go / "controller.safetensors", "input_output")[0], best
+    )
 
 
 def test_the_first_of_two_equally_good_looks_is_kept():
@@ -198,7 +227,9 @@ def test_an_agent_s_returns_are_those_of_its_own_drives_on_the_tracks_of_the_gen
 def test_an_agent_that_gets_nowhere_is_given_up_in_a_generation_and_not_in_validation(quick_run):
     impatient, braking = settings(patience=25, max_frames=80), initial_parameters(32, 24, gas=-9.0)
     with ThreadPoolExecutor(1) as executor:
-        entry = drive_generation(executor, quick_run, "input_output", impatient, [], np.tile(braking, (2, 1)))
+        entry = drive_generation(
+            executor, quick_run, "input_output", impatient, [], np.tile(braking, (2, 1))
+        )
         look = validate(executor, quick_run, "input_output", impatient, braking)
     assert entry["frames"] < 2 * 80 and look["frames"] == impatient.validation_tracks * 80
 
@@ -206,9 +237,15 @@ def test_an_agent_that_gets_nowhere_is_given_up_in_a_generation_and_not_in_valid
 def test_a_hard_track_is_one_on_which_the_average_agent_does_badly():
     rested = [{"tracks": [number], "returns": [[0.0], [0.0]]} for number in range(4)]
     back = settings(revisited_share=0.25, tracks=4)
-    for ours, other in (([0.0, 90.0], [50.0, 50.0]), ([40.0, 50.0], [0.0, 100.0])):  # 45 on average, and 50
+    for ours, other in (
+        ([0.0, 90.0], [50.0, 50.0]),
+        ([40.0, 50.0], [0.0, 100.0]),
+    ):  # 45 on average, and 50
         returns = [[b, a, 99.0, 99.0] for a, b in zip(ours, other, strict=True)]
-        assert generation_tracks(back, [{"tracks": [10, 11, 12, 13], "returns": returns}, *rested])[0] == 11
+        assert (
+            generation_tracks(back, [{"tracks": [10, 11, 12, 13], "returns": returns}, *rested])[0]
+            == 11
+        )
 
 
 def test_half_of_the_generations_go_back_to_the_hardest_track_that_has_rested():
@@ -217,13 +254,24 @@ def test_half_of_the_generations_go_back_to_the_hardest_track_that_has_rested():
     for number in range(60):
         tracks = generation_tracks(back, log)
         new = generation_tracks(settings(), log)
-        rested = {entry["tracks"][0] for entry in log[-20:]} - {entry["tracks"][0] for entry in log[-4:]}
+        rested = {entry["tracks"][0] for entry in log[-20:]} - {
+            entry["tracks"][0] for entry in log[-4:]
+        }
         if number % 2 and rested:
-            assert tracks == [min(rested, key=difficulty.get)]  # what it was when it was last driven
+            assert tracks == [
+                min(rested, key=difficulty.get)
+            ]  # what it was when it was last driven
         else:
             assert tracks == new and new[0] not in difficulty
-        difficulty[tracks[0]] = float((7 * number) % 23)  # of all agents together: some are better, some worse
-        log.append({"tracks": tracks, "returns": [[difficulty[tracks[0]] - 5.0], [difficulty[tracks[0]] + 5.0]]})
+        difficulty[tracks[0]] = float(
+            (7 * number) % 23
+        )  # of all agents together: some are better, some worse
+        log.append(
+            {
+                "tracks": tracks,
+                "returns": [[difficulty[tracks[0]] - 5.0], [difficulty[tracks[0]] + 5.0]],
+            }
+        )
     assert len(difficulty) == 32  # the first two of thirty goes back found nothing to go back to
 
 
@@ -299,7 +347,12 @@ def test_from_300_parameters_on_two_agents_stand_ahead_of_the_mean_and_behind_it
             population = ask(strategy, quick, 1)
             steps = population - strategy.mean
             along = steps @ move / np.linalg.norm(steps, axis=1)
-            tell(strategy, population, [[[1.0, -1.0][number != better]] for number in (0, 1)] + [[0.0]] * 6, [])
+            tell(
+                strategy,
+                population,
+                [[[1.0, -1.0][number != better]] for number in (0, 1)] + [[0.0]] * 6,
+                [],
+            )
             growth.append(strategy.sigma / sigma)
         if parameters < 300:
             assert np.abs(along).max() < 0.5
@@ -310,9 +363,15 @@ def test_from_300_parameters_on_two_agents_stand_ahead_of_the_mean_and_behind_it
 
 @pytest.mark.long
 def test_the_shape_stays_round_in_the_long_run_of_notebook_04_as_with_scores_drawn_at_random():
-    log, long_run = load_json(PRETRAINED / "input" / LOG), load_json(PRETRAINED / "input" / "record.json")
+    log, long_run = (
+        load_json(PRETRAINED / "input" / LOG),
+        load_json(PRETRAINED / "input" / "record.json"),
+    )
     chosen, random = Settings.from_dict(long_run["settings"]), np.random.default_rng(0)
-    for told in (lambda entry: entry["returns"], lambda entry: random.standard_normal(np.shape(entry["returns"]))):
+    for told in (
+        lambda entry: entry["returns"],
+        lambda entry: random.standard_normal(np.shape(entry["returns"])),
+    ):
         strategy = make_strategy(initial_parameters(32, 256, chosen.initial_gas), chosen)
         for number, entry in enumerate(log["generations"]):
             tell(strategy, ask(strategy, chosen, number), list(told(entry)), [])
@@ -322,10 +381,16 @@ def test_the_shape_stays_round_in_the_long_run_of_notebook_04_as_with_scores_dra
 
 
 def test_a_search_runs_on_one_thread_wherever_more_are_to_be_had(quick_run, tmp_path, monkeypatch):
-    folder, seen, more = without_evolution(quick_run, tmp_path / "run"), {}, 2 if os.cpu_count() > 1 else 1
+    folder, seen, more = (
+        without_evolution(quick_run, tmp_path / "run"),
+        {},
+        2 if os.cpu_count() > 1 else 1,
+    )
 
     def of_numpy():
-        return max(library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas")
+        return max(
+            library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"
+        )
 
     def watch(name, threads):
         real = getattr(evolution, name)
@@ -367,7 +432,9 @@ def test_a_replay_restores_the_full_state():
     strategy, log = make_strategy(start, settings()), []
     for _ in range(12):
         population = strategy.ask()
-        returns = [[-float((agent**2).sum()), -float(((agent - 1) ** 2).sum())] for agent in population]
+        returns = [
+            [-float((agent**2).sum()), -float(((agent - 1) ** 2).sum())] for agent in population
+        ]
         strategy.tell(population, [-np.mean(pair) for pair in returns])
         replayed, _ = replay(start, settings(), log)
         following = replayed.ask()
@@ -403,11 +470,11 @@ def test_numpy_s_global_random_state_is_untouched_and_untouching():
             strategy.tell(population, [float((agent**2).sum()) for agent in population])
         return strategy.mean
 
-    np.random.seed(1)  # noqa: NPY002
-    state = np.random.get_state()[1].tolist()  # noqa: NPY002
+    np.random.seed(1)
+    state = np.random.get_state()[1].tolist()
     first = best_of_five()
-    assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
-    np.random.seed(2)  # noqa: NPY002
+    assert np.random.get_state()[1].tolist() == state
+    np.random.seed(2)
     assert np.array_equal(best_of_five(), first)
 
 
@@ -418,7 +485,8 @@ def test_a_log_that_was_changed_is_refused(first_part, tmp_path):
     returns[int(np.argmin(returns))] = [1000.0]
     save_json(folder / "evolution.json", log)
     with pytest.raises(
-        ValueError, match=r"another mean in generation 1 than the run had: .*changed.*Start in a new folder"
+        ValueError,
+        match=r"another mean in generation 1 than the run had: .*changed.*Start in a new folder",
     ):
         evolve("input_output", settings(), folder)
     assert {**read(folder), "checksum": 0} == {**log, "checksum": 0}
@@ -433,7 +501,10 @@ def test_a_damaged_log_is_refused(first_part, tmp_path):
 
 
 def test_a_log_of_other_settings_is_refused(first_part):
-    with pytest.raises(ValueError, match=r"holds a run with sigma=0.1, and now sigma=0.2 is asked for: choose another"):
+    with pytest.raises(
+        ValueError,
+        match=r"holds a run with sigma=0.1, and now sigma=0.2 is asked for: choose another",
+    ):
         evolve("input_output", settings(sigma=0.2), first_part)
 
 
@@ -441,7 +512,9 @@ def test_a_deleted_controller_is_made_again(one_go, tmp_path):
     folder = shutil.copytree(one_go, tmp_path / "run")
     (folder / "controller.safetensors").unlink()
     evolve("input_output", settings(), folder)
-    assert (folder / "controller.safetensors").read_bytes() == (one_go / "controller.safetensors").read_bytes()
+    assert (folder / "controller.safetensors").read_bytes() == (
+        one_go / "controller.safetensors"
+    ).read_bytes()
 
 
 def test_a_damaged_controller_is_not_taken_for_a_finished_run(one_go, tmp_path):
@@ -454,7 +527,9 @@ def test_a_damaged_controller_is_not_taken_for_a_finished_run(one_go, tmp_path):
 
 def test_a_look_is_the_mean_of_its_returns_on_the_same_tracks_for_every_seed(monkeypatch):
     asked, found = [], (np.array([0.0, 100.0, 800.0]), np.array([50, 60, 70]))
-    monkeypatch.setattr("stad_lab.training.evolution.drive_parallel", lambda *given: asked.append(given) or found)
+    monkeypatch.setattr(
+        "stad_lab.training.evolution.drive_parallel", lambda *given: asked.append(given) or found
+    )
     for seed in (0, 1):
         chosen = Settings.preset("quick", validation_tracks=3, seed=seed, evolution_seed=seed)
         look = validate(None, None, "input", chosen, np.zeros(9))
@@ -463,8 +538,12 @@ def test_a_look_is_the_mean_of_its_returns_on_the_same_tracks_for_every_seed(mon
 
 
 def test_a_generation_counts_every_frame_of_every_agent_on_every_track(monkeypatch):
-    monkeypatch.setattr("stad_lab.training.evolution.drive_parallel", lambda *given: (np.arange(8.0), np.arange(8)))
-    entry = drive_generation(None, None, "input", Settings.preset("quick", tracks=2), [], np.zeros((4, 9)))
+    monkeypatch.setattr(
+        "stad_lab.training.evolution.drive_parallel", lambda *given: (np.arange(8.0), np.arange(8))
+    )
+    entry = drive_generation(
+        None, None, "input", Settings.preset("quick", tracks=2), [], np.zeros((4, 9))
+    )
     assert entry["frames"] == 28 and entry["returns"] == [[0, 1], [2, 3], [4, 5], [6, 7]]
 
 

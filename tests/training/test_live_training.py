@@ -28,7 +28,9 @@ print("complete:", watch_training(train, draw))
 @pytest.fixture(scope="module")
 def kernel():
     """A kernel as JupyterLab starts it: (manager, client)."""
-    manager, client = start_new_kernel(kernel_name="python3", env={**os.environ, "OMP_NUM_THREADS": "1"})
+    manager, client = start_new_kernel(
+        kernel_name="python3", env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
     yield manager, client
     client.stop_channels()
     manager.shutdown_kernel(now=True)
@@ -41,9 +43,9 @@ def run_cell(kernel, code, interrupt_after=None):
 
     def take(message):
         content = message["content"]
-        if message["msg_type"] in ("display_data", "update_display_data") and "<img" in content["data"].get(
-            "text/html", ""
-        ):
+        if message["msg_type"] in ("display_data", "update_display_data") and "<img" in content[
+            "data"
+        ].get("text/html", ""):
             figures.append(content["data"]["text/html"])
             if len(figures) == interrupt_after:
                 manager.interrupt_kernel()
@@ -59,7 +61,9 @@ def step_of(figure):
     return int(re.search(r'alt="step (\d+)', figure)[1])
 
 
-def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(kernel, quick_run, tmp_path):
+def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(
+    kernel, quick_run, tmp_path
+):
     settings = Settings.preset("quick", v_steps=20)
     shutil.copytree(quick_run / "rollouts", tmp_path / "rollouts")
     stopped, straight = tmp_path / "stopped", tmp_path / "straight"
@@ -68,7 +72,11 @@ def test_a_training_that_was_stopped_in_its_cell_goes_on_to_the_last_bit(kernel,
     cell = f"FOLDER = {str(stopped)!r}\n{TRAIN}"
 
     printed, figures, error = run_cell(kernel, cell, interrupt_after=2)
-    assert error is None and "stopped: nothing that was logged is lost" in printed and "complete: False" in printed
+    assert (
+        error is None
+        and "stopped: nothing that was logged is lost" in printed
+        and "complete: False" in printed
+    )
     printed, again, error = run_cell(kernel, cell)
     assert error is None and "complete: True" in printed
     # It shows at once what was there: what was seen last, or a step more, if the stop came between file and figure.

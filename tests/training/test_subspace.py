@@ -47,8 +47,14 @@ def searched(quick_run, tmp_path_factory):
 def random_drives(columns, lengths=(40, 60), scales=None):
     """What C might see in some episodes: correlated numbers, around a middle that is not zero."""
     rng = np.random.default_rng(0)
-    mixed = rng.standard_normal((columns, columns)) * (np.ones(columns) if scales is None else scales)[:, None]
-    return [(rng.standard_normal((length, columns)) @ mixed + 3).astype(np.float32) for length in lengths]
+    mixed = (
+        rng.standard_normal((columns, columns))
+        * (np.ones(columns) if scales is None else scales)[:, None]
+    )
+    return [
+        (rng.standard_normal((length, columns)) @ mixed + 3).astype(np.float32)
+        for length in lengths
+    ]
 
 
 def test_the_components_are_those_of_largest_variance_over_all_episodes():
@@ -57,21 +63,29 @@ def test_the_components_are_those_of_largest_variance_over_all_episodes():
     seen = np.concatenate(drives).astype(float)
     assert middle == pytest.approx(seen.mean(axis=0))
     _, _, expected = np.linalg.svd(seen - seen.mean(axis=0))
-    assert np.abs(components @ expected[:4].T) == pytest.approx(np.eye(4), abs=1e-6)  # the sign is free
+    assert np.abs(components @ expected[:4].T) == pytest.approx(
+        np.eye(4), abs=1e-6
+    )  # the sign is free
 
 
-@pytest.mark.parametrize(("sees", "columns"), [("z", slice(3)), ("h", slice(3, 8)), ("z, h", slice(0, 8))])
+@pytest.mark.parametrize(
+    ("sees", "columns"), [("z", slice(3)), ("h", slice(3, 8)), ("z, h", slice(0, 8))]
+)
 def test_what_c_may_not_see_has_no_weight(quick_run, sees, columns):
     drives, seen = random_drives(8), seen_columns(sees, 3, 5)
     _, components = principal_components(drives, seen, 100)
     assert components.shape == (seen.sum(), 8) and np.linalg.matrix_rank(components) == seen.sum()
     assert (np.delete(components, columns, axis=1) == 0).all()
-    space = search_space(Settings.preset("quick", features=sees), read_world_model(quick_run, VARIANT), quick_run)
+    space = search_space(
+        Settings.preset("quick", features=sees), read_world_model(quick_run, VARIANT), quick_run
+    )
     whole = space.expand(np.ones(len(space.first)))
     weights = whole[:-3].reshape(3, 56)
     hidden = {"z": slice(32, 56), "h": slice(32), "z, h": slice(0)}[sees]
     assert (
-        (weights[:, hidden] == 0).all() and (np.delete(weights, hidden, axis=1) == 1).all() and (whole[-3:] == 1).all()
+        (weights[:, hidden] == 0).all()
+        and (np.delete(weights, hidden, axis=1) == 1).all()
+        and (whole[-3:] == 1).all()
     )
 
 
@@ -83,7 +97,11 @@ def test_a_c_of_the_components_does_what_its_weights_say(searched, quick_run):
     seen = np.concatenate([features(world_model, *drive) for drive in drives])
     middle, components = principal_components([seen], np.ones(56, bool), 5)
     found = np.random.default_rng(0).standard_normal(3 * 5 + 3)
-    raw = (seen - middle) @ components.T @ found[:15].reshape(3, 5).T + found[15:] + [0, SETTINGS.initial_gas, 0]
+    raw = (
+        (seen - middle) @ components.T @ found[:15].reshape(3, 5).T
+        + found[15:]
+        + [0, SETTINGS.initial_gas, 0]
+    )
     steering = control(space.expand(found), seen)[:, 0]
     assert steering.std() > 0.02 and steering == pytest.approx(np.tanh(raw[:, 0]), abs=1e-3)
 
@@ -108,11 +126,16 @@ def test_components_are_found_once_and_belong_to_their_v_and_m(searched, quick_r
     with pytest.raises(FileNotFoundError, match=r"components\.safetensors"):
         search_space(SETTINGS, read_world_model(other, VARIANT), other)
     assert find_components(VARIANT, SETTINGS, quick_run / "rollouts", other)
-    assert (other / "components.safetensors").read_bytes() == (searched / "components.safetensors").read_bytes()
+    assert (other / "components.safetensors").read_bytes() == (
+        searched / "components.safetensors"
+    ).read_bytes()
 
 
 def test_a_file_under_the_name_of_another_part_is_refused(searched, tmp_path):
-    folder, world_model = shutil.copytree(searched, tmp_path / "run"), read_world_model(searched, VARIANT)
+    folder, world_model = (
+        shutil.copytree(searched, tmp_path / "run"),
+        read_world_model(searched, VARIANT),
+    )
     shutil.copy(folder / "components.safetensors", folder / "start.safetensors")
     with pytest.raises(ValueError, match="holds 'components': expected 'start'"):
         search_space(SETTINGS, world_model, folder)
@@ -125,7 +148,9 @@ def test_a_file_under_the_name_of_another_part_is_refused(searched, tmp_path):
 def test_a_search_does_not_go_on_along_other_components(searched, quick_run, tmp_path):
     folder, other = (shutil.copytree(searched, tmp_path / name) for name in ("run", "other"))
     (other / "components.safetensors").unlink()
-    fewer = Settings.preset("quick", episodes=4)  # the components of other rollouts, for the same V and M
+    fewer = Settings.preset(
+        "quick", episodes=4
+    )  # the components of other rollouts, for the same V and M
     collect_rollouts(fewer, tmp_path / "rollouts")
     assert find_components(VARIANT, SETTINGS, tmp_path / "rollouts", other)
     shutil.copy(other / "components.safetensors", folder)

@@ -43,9 +43,9 @@ def test_the_latent_explorer_has_a_slider_for_each_latent_and_redraws_in_less_th
 
 def test_the_latent_explorer_begins_at_its_z_even_far_out(agent):
     z = np.linspace(-6.3, 5.2, 32, dtype=np.float32)
-    assert [slider.value for slider in find(explore_latents(agent.autoencoder, z), FloatSlider)] == pytest.approx(
-        z.tolist(), abs=0.006
-    )
+    assert [
+        slider.value for slider in find(explore_latents(agent.autoencoder, z), FloatSlider)
+    ] == pytest.approx(z.tolist(), abs=0.006)
 
 
 def test_the_viewer_shows_another_picture_for_another_moment(inside):
