@@ -8,12 +8,12 @@ import importlib
 
 HOMES = {
     "Agent": "agent",
-    "Settings": "config",
+    "Config": "config",
     "check_environment": "doctor",
     "load_agent": "agent",
     "make_env": "envs.car_racing",
 }
-__all__ = ["Agent", "Settings", "check_environment", "load_agent", "make_env"]
+__all__ = ["Agent", "Config", "check_environment", "load_agent", "make_env"]
 
 
 def __getattr__(name: str):

@@ -1,288 +1,358 @@
-"""The settings: one frozen dataclass with three presets, `quick`, `laptop` and `paper`.
+"""The configuration of a run: one frozen dataclass for each stage, and three presets.
 
-Every number that one may want to change for a run is here, with its unit. A run's settings are written into its folder,
-so a result can always be traced back to them.
+`Config.preset("laptop")` is the default; `quick` shows in a minute that everything works, `paper`
+is the budget that the paper states. A run's configuration is written into its folder. Each stage
+depends on its own part alone: another step size of CMA-ES leaves a trained V valid.
+
+The docstring below each field is its help on the command line. A field that is added later needs a
+default that means what the code did before, so that older runs stay valid.
 """
 
 import dataclasses
 import os
-from dataclasses import dataclass
+import typing
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any, Literal
 
-ENVIRONMENT_VARIABLE = "STAD_LAB_SETTINGS"
+import numpy as np
+
+PRESET_VARIABLE = "STAD_LAB_PRESET"
+VARIANTS = ("frame", "input", "output", "input_output")
+SMALLEST_SIGMA = 1e-12  # near 0 CMA-ES cannot compute
+
+# (lowest, highest) value of a field; an int or float that is not listed is at least 1, or above 0.
+RANGES = {
+    "seed": (0, 2**63),
+    "processes": (1, 10_000),
+    "data.episodes": (2, 1_000_000),  # one to train on, one held out
+    "data.episode_frames": (1, 1000),  # CarRacing ends an episode then
+    "data.random_starts": (0, 1),
+    "data.agent_episodes": (0, 1_000_000),
+    "data.agent_frames": (1, 1000),
+    "data.agent_patience": (0, 1e12),
+    "vae.latent_size": (1, 10_000),
+    "vae.width": (1, 1000),
+    "vae.kl_weight": (0, 1e12),
+    "vae.free_bits": (0, 1e12),
+    "vae.difference_weight": (0, 1e12),
+    "mdn_rnn.hidden_size": (1, 10_000),
+    "mdn_rnn.mixtures": (1, 1000),
+    "mdn_rnn.steps": (0, 1e12),
+    "evolution.seed": (0, 2**63),
+    "evolution.population": (4, 100_000),
+    "evolution.replay_share": (0, 1),
+    "evolution.sigma_decay": (0, 1),
+    "evolution.components": (0, 1e12),
+    "evolution.initial_gas": (-100, 1e12),
+    "evolution.patience": (0, 1e12),
+    "evolution.max_frames": (1, 1000),
+    "evolution.averaged_share": (0, 1),
+}
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Everything that shapes a run. Defaults are the `laptop` preset.
+class DataConfig:
+    """The dataset: what is driven for it, and how a frame is made."""
 
-    Raises:
-        ValueError: a value of the wrong type or out of its range, with the name, the value and what was expected.
-    """
-
-    name: str = "laptop"
-    """Name of the preset these settings began as."""
-    seed: int = 0
-    """Seed of the whole run: data and weights follow from it, and with `evolution_seed` the search for C."""
-    processes: int = 2
-    """Worker processes that drive cars; a search can use one for each group of `cars`. The results are the same."""
-
-    # Frames and differences (paper, sections 3.1 and 4)
-    crop_bar: bool = True
-    """Cut the indicator bar (lowest 12 of 96 rows) off before shrinking, as World Models does."""
-    stride: int = 4
-    """k of the difference image d_t = x_t - x_(t-k), in frames."""
-
-    # Rollouts of the random driver
     episodes: int = 900
-    """Episodes to collect."""
+    """Episodes of the random driver."""
     episode_frames: int = 120
-    """Frames of an episode, at most. A random driver is soon off the road: short episodes see more of it."""
+    """Frames of such an episode, at most. A random driver soon leaves the road."""
     random_starts: float = 0.9
-    """Share of the episodes that start moving, on a random tile, instead of at rest on tile 0."""
+    """Share of these episodes that start moving, on a random tile, instead of at rest on tile 0."""
+    crop_bar: bool = True
+    """Cut off the indicator bar (the lowest 12 of 96 rows), as World Models does."""
     agent_episodes: int = 0
-    """Episodes that the agent of an earlier run drives for the dataset, in a second round; 0 in a first one."""
+    """Episodes that the agent of an earlier run drives, in a second iteration; 0 in the first."""
+    agent_frames: int = 1000
+    """Frames of an agent's episode, at most."""
+    agent_patience: int = 100
+    """An agent's episode ends after so many frames without a new tile; 0 for never."""
 
-    # V, the autoencoder
+
+@dataclass(frozen=True)
+class VAEConfig:
+    """V, the variational autoencoder."""
+
     latent_size: int = 32
     """Dimensions of z."""
     width: int = 16
-    """Channels of V's first convolution; the others follow from it. World Models has 32."""
+    """Channels of the first convolution; the others follow from it. World Models has 32."""
+    stride: int = 4
+    """k of the difference image d_t = x_t - x_(t-k), in frames."""
     kl_weight: float = 0.25
-    """Weight of the KL term against the squared errors. World Models has 1."""
+    """Weight of the KL term beside the squared error. World Models has 1."""
     free_bits: float = 0.0
-    """A picture's whole KL costs nothing below so many nats times `latent_size`. World Models has 0.5."""
+    """Nats for each latent below which the KL is not penalised. World Models has 0.5."""
     difference_weight: float = 1.0
-    """Weight of the difference image's squared error, in the variants that redraw it."""
-    v_steps: int = 5000
-    """Training steps of V."""
-    v_batch: int = 128
+    """Weight of the difference image's squared error, in the variants that reconstruct it."""
+    steps: int = 5000
+    """Training steps."""
+    batch: int = 128
     """Frames in a batch."""
-    v_learning_rate: float = 1e-3
-    """Adam's rate at the start; it falls to a tenth along a cosine."""
+    learning_rate: float = 1e-3
+    """Adam's learning rate at the start; it falls to a tenth along a cosine."""
 
-    # M, the MDN-RNN
+
+@dataclass(frozen=True)
+class MDNRNNConfig:
+    """M, the MDN-RNN."""
+
     hidden_size: int = 256
     """Units of the LSTM."""
     mixtures: int = 5
     """Gaussians in the mixture of each latent dimension."""
-    m_steps: int = 1500
-    """Training steps of M."""
-    m_batch: int = 64
+    steps: int = 1500
+    """Training steps; 0 leaves M untrained."""
+    batch: int = 64
     """Sequences in a batch."""
-    m_sequence: int = 100
+    sequence: int = 100
     """Frames in a sequence."""
-    m_learning_rate: float = 2e-3
-    """Adam's rate at the start; it falls to a tenth along a cosine."""
+    learning_rate: float = 2e-3
+    """Adam's learning rate at the start; it falls to a tenth along a cosine."""
 
-    # C, evolved by CMA-ES
+
+@dataclass(frozen=True)
+class EvolutionConfig:
+    """C, evolved by CMA-ES."""
+
+    seed: int = 0
+    """Seed of the candidates and of the tracks: several CMA-ES runs may share one V and M."""
     generations: int = 55
-    """Generations of CMA-ES."""
+    """Generations of CMA-ES; a finished run may be continued with more."""
     population: int = 64
     """Agents in a generation."""
     tracks: int = 1
-    """Tracks that each agent drives in a generation; all agents of a generation drive the same ones."""
-    revisited_share: float = 0.0
-    """Share of the tracks that are hard ones of before again, instead of new ones."""
+    """Tracks that each agent drives in a generation, the same for all agents."""
+    replay_share: float = 0.0
+    """Share of the tracks that are hard earlier ones instead of new ones."""
     sigma: float = 0.1
-    """CMA-ES's first step size."""
+    """Initial step size."""
     sigma_decay: float = 0.97
-    """What the step size is multiplied with in every generation; 0 leaves it to CMA-ES."""
+    """Factor on the step size in each generation; 0 leaves the step size to CMA-ES."""
+    step_size_rule: Literal["CSA", "TPA"] = "CSA"
+    """How CMA-ES adapts sigma: cumulative path length (World Models) or two-point adaptation."""
     components: int = 48
-    """Search along so many principal components of what C sees; 0 for along every weight of its own."""
-    evolution_seed: int = 0
-    """Seed of the mutations and of the tracks that are evolved on: several searches may share one V and M."""
-    features: str = "z, h"
-    """What C sees: "z, h", or "z" or "h" alone, to find out what each of them is worth."""
+    """Search along so many principal components of z and h; 0 for along every weight of C."""
+    features: Literal["z, h", "z", "h"] = "z, h"
+    """What C sees."""
     initial_gas: float = -0.5
     """Gas output of the first controller before squashing; (tanh(-0.5) + 1) / 2 is 27% gas."""
     patience: int = 100
-    """In training, an episode that reaches no new tile for this many frames is ended; 0 for never."""
+    """A training episode ends after so many frames without a new tile; 0 for never."""
     max_frames: int = 1000
-    """Frames of an episode in a search, in its looks or for a second round, at most; CarRacing's own limit is 1,000."""
+    """Frames of a training or validation episode, at most."""
     cars: int = 16
-    """Cars that one process drives in step, at most, with one batch through V and M. Fewer keep more processes busy."""
+    """Cars that drive in one batch, at most. Fewer keep more processes busy."""
     validate_every: int = 5
-    """Generations between two looks at C so far on the validation tracks."""
+    """Generations between two validations of the mean controller."""
     validation_tracks: int = 16
-    """Tracks of such a look."""
+    """Tracks of a validation."""
     averaged_share: float = 0.4
-    """Share of the generations, the last ones, whose CMA means are averaged into C; 0 for the last mean alone."""
+    """Share of the generations, the last ones, whose means are averaged into C; 0 for the last."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Everything that determines a run. The defaults are the `laptop` preset.
+
+    Raises:
+        ValueError: a value of the wrong type or out of range; the message names it.
+    """
+
+    variant: Literal["frame", "input", "output", "input_output"] = "input_output"
+    """Which pictures V sees and reconstructs; `frame` is World Models without difference images."""
+    seed: int = 0
+    """Seed of the dataset, of the initial weights and of the training."""
+    processes: int = 2
+    """Worker processes; the results do not depend on their number."""
+    data: DataConfig = field(default_factory=DataConfig)
+    vae: VAEConfig = field(default_factory=VAEConfig)
+    mdn_rnn: MDNRNNConfig = field(default_factory=MDNRNNConfig)
+    evolution: EvolutionConfig = field(default_factory=EvolutionConfig)
 
     def __post_init__(self):
-        for field in dataclasses.fields(self):
-            check_value(field.name, field.type, getattr(self, field.name))
-        if self.episode_frames <= self.stride:
-            raise ValueError(
-                f"episode_frames={self.episode_frames}, but with stride={self.stride} the first difference image"
-                f" exists only after {self.stride} frames: use more than {self.stride} frames"
-            )
-        if self.generations % self.validate_every:
-            raise ValueError(
-                f"generations={self.generations} is not a multiple of validate_every={self.validate_every}: the last"
-                " generation must be one that is validated"
-            )
-        if self.sigma_decay and self.sigma * self.sigma_decay**self.generations < SMALLEST_STEP:
-            raise ValueError(
-                f"sigma_decay={self.sigma_decay} shrinks sigma={self.sigma} below {SMALLEST_STEP} in {self.generations}"
-                " generations: use a sigma_decay nearer to 1, or 0 for CMA-ES's own step size"
-            )
-        if self.m_sequence >= self.episode_frames:
-            raise ValueError(
-                f"m_sequence={self.m_sequence} does not fit into episodes of episode_frames={self.episode_frames}:"
-                f" use at most {self.episode_frames - 1}"
-            )
+        for name, kind, value in fields_of(self):
+            check_value(name, kind, value)
+        check_together(self)
 
     @staticmethod
-    def preset(name: str | None = None, /, **changes) -> "Settings":
-        """Look up a preset by name.
+    def preset(name: str | None = None, /, **changes) -> "Config":
+        """Look up a preset and change some fields.
 
         Args:
-            name: "quick", "laptop" or "paper", by its place; None reads the environment variable STAD_LAB_SETTINGS,
+            name: "quick", "laptop" or "paper"; None reads the environment variable STAD_LAB_PRESET,
                 and takes "laptop" if that is not set.
-            **changes: fields to set differently, for example `stride=2`; all but the name.
+            **changes: as for `replace`.
 
         Raises:
-            ValueError: an unknown preset, an unknown field, or a value out of range.
+            ValueError: an unknown preset or field, or a value out of range.
         """
-        name = name or os.environ.get(ENVIRONMENT_VARIABLE) or "laptop"
+        name = name or os.environ.get(PRESET_VARIABLE) or "laptop"
         if name not in PRESETS:
-            raise ValueError(f"unknown settings {name!r}: choose one of {', '.join(PRESETS)}")
-        if changes.get("name", name) != name:
-            raise ValueError(
-                f"name={changes['name']!r} of the settings {name!r}: the name cannot be set; choose a preset with"
-                f" Settings.preset(NAME) or --settings NAME ({', '.join(PRESETS)})"
-            )
-        return dataclasses.replace(PRESETS[name], **known_fields(changes))
+            raise ValueError(f"unknown preset {name!r}: choose one of {', '.join(PRESETS)}")
+        return PRESETS[name].replace(**changes)
+
+    def replace(self, **changes) -> "Config":
+        """A copy with other values, for example `replace(seed=1, vae={"stride": 2})`."""
+        return from_dict(Config, changes, self)
 
     def as_dict(self) -> dict:
-        """All fields as a plain dict, for JSON."""
+        """All fields as nested dicts, for JSON."""
         return dataclasses.asdict(self)
 
     @staticmethod
-    def from_dict(values: dict) -> "Settings":
-        """The inverse of `as_dict`. Raises ValueError for unknown fields or values out of range."""
-        return Settings(**known_fields(values))
+    def from_dict(values: dict) -> "Config":
+        """The inverse of `as_dict`; a missing field has its default, an unknown one is refused."""
+        return from_dict(Config, values, Config())
 
 
-NO_LESS_THAN_ZERO = (
-    "seed",
-    "evolution_seed",
-    "patience",
-    "kl_weight",
-    "free_bits",
-    "difference_weight",
-    "m_steps",
-    "agent_episodes",
-    "components",
-)
-AT_LEAST = {"episodes": 2, "population": 4, "initial_gas": -100.0}
-AT_MOST = {
-    "episode_frames": 1000,  # CarRacing ends an episode then
-    "max_frames": 1000,
-    "processes": 10_000,  # beyond this and the next no machine has the room, and would say so only after hours
-    "episodes": 1_000_000,
-    "width": 1000,
-    "latent_size": 10_000,
-    "hidden_size": 10_000,
-    "mixtures": 1000,
-    "population": 100_000,
-}
-SMALLEST_STEP = 1e-12  # of the search; near 0 CMA-ES cannot compute
-SHARES = ("random_starts", "revisited_share", "averaged_share", "sigma_decay")
-FEATURES = ("z, h", "z", "h")
+def from_dict(kind: type, values: dict, base: Any) -> Any:
+    """A copy of the dataclass `base` with the values of a nested dict."""
+    known = {one.name: one.type for one in dataclasses.fields(kind)}
+    for name in values:
+        if name not in known:
+            raise ValueError(f"unknown setting {name!r}: expected one of {', '.join(known)}")
+    nested = {
+        name: from_dict(known[name], value, getattr(base, name))
+        if isinstance(value, dict)
+        else value
+        for name, value in values.items()
+    }
+    return dataclasses.replace(base, **nested)
 
 
-def check_value(name: str, kind: type, value: object) -> None:
-    """Raise ValueError unless `value` is a sensible value of the field `name`."""
+def fields_of(config: Config) -> list[tuple[str, Any, Any]]:
+    """(dotted name, type, value) of every field, stage by stage."""
+    found = []
+    for one in dataclasses.fields(config):
+        value = getattr(config, one.name)
+        if not dataclasses.is_dataclass(one.type):
+            found.append((one.name, one.type, value))
+            continue
+        if not isinstance(value, one.type):
+            raise ValueError(
+                f"{one.name}={value!r}: expected a {one.type.__name__} or a dict of it"
+            )
+        found += [
+            (f"{one.name}.{part.name}", part.type, getattr(value, part.name))
+            for part in dataclasses.fields(one.type)
+        ]
+    return found
+
+
+def check_value(name: str, kind: Any, value: Any) -> None:
+    """Raise ValueError unless `value` is a valid value of the field `name`."""
+    if choices := typing.get_args(kind):
+        if value not in choices:
+            raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, choices))}")
+        return
     if type(value) is not kind and not (kind is float and type(value) is int):
         raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
     if kind in (int, float):
-        lowest = AT_LEAST.get(
-            name, 0 if name in (*NO_LESS_THAN_ZERO, *SHARES) else 1 if kind is int else 1e-12
-        )
-        highest = AT_MOST.get(name, 1.0 if name in SHARES else 1e12)
-        if not lowest <= value <= highest:
-            raise ValueError(
-                f"{name}={value!r} is out of range: expected {lowest:g} to {highest:g}"
-            )
-    if name == "name" and value not in ("quick", "laptop", "paper"):
+        low, high = RANGES.get(name, (1 if kind is int else SMALLEST_SIGMA, 1e12))
+        if not low <= value <= high:
+            raise ValueError(f"{name}={value!r} is out of range: expected {low:g} to {high:g}")
+
+
+def check_together(config: Config) -> None:
+    """Raise ValueError for values that are valid alone but not together."""
+    frames, evolution = config.data.episode_frames, config.evolution
+    if frames <= config.vae.stride:
         raise ValueError(
-            f"name={value!r}: expected the preset that the settings began as, quick, laptop or paper"
+            f"data.episode_frames={frames}: expected more than vae.stride={config.vae.stride},"
+            " before which no difference image exists"
         )
-    if name == "features" and value not in FEATURES:
-        raise ValueError(f"features={value!r}: choose one of {', '.join(map(repr, FEATURES))}")
+    if config.mdn_rnn.sequence >= frames:
+        raise ValueError(
+            f"mdn_rnn.sequence={config.mdn_rnn.sequence} does not fit into episodes of"
+            f" data.episode_frames={frames}: use at most {frames - 1}"
+        )
+    if evolution.generations % evolution.validate_every:
+        raise ValueError(
+            f"evolution.generations={evolution.generations} is not a multiple of"
+            f" evolution.validate_every={evolution.validate_every}: the last one is validated"
+        )
+    last_sigma = evolution.sigma * evolution.sigma_decay**evolution.generations
+    if evolution.sigma_decay and last_sigma < SMALLEST_SIGMA:
+        raise ValueError(
+            f"evolution.sigma_decay={evolution.sigma_decay} shrinks sigma={evolution.sigma} below"
+            f" {SMALLEST_SIGMA} in {evolution.generations} generations: use a factor nearer to 1,"
+            " or 0 for CMA-ES's own step size"
+        )
 
 
-def known_fields(values: dict) -> dict:
-    """Return `values` unchanged, or raise ValueError if one of its keys is not a field of Settings."""
-    fields = [field.name for field in dataclasses.fields(Settings)]
-    for name in values:
-        if name not in fields:
-            raise ValueError(f"unknown setting {name!r}: the settings are {', '.join(fields)}")
-    return values
+def check_variant(variant: str) -> None:
+    """Raise ValueError unless `variant` is one of the four."""
+    if variant not in VARIANTS:
+        raise ValueError(f"unknown variant {variant!r}: choose one of {', '.join(VARIANTS)}")
 
 
-MAY_CHANGE = ("name", "processes", "generations")  # between a run and its continuation
+def check_same(path: Path, was: dict, now: dict, prefix: str = "") -> None:
+    """Raise ValueError if what is in `path` was made with other values than `now` asks for.
 
-
-def check_same_run(path: Path, was: dict, now: dict) -> None:
-    """Raise ValueError if the run in `path`, a folder or a file of it, was made with other values than `now` holds."""
-    for name in now:
-        if name not in MAY_CHANGE and was.get(name) != now[name]:
+    Both are nested dicts. A value that `was` lacks did not exist then and counts as equal.
+    """
+    for name, value in now.items():
+        if isinstance(value, dict) and isinstance(was.get(name), dict):
+            check_same(path, was[name], value, f"{prefix}{name}.")
+        elif name in was and was[name] != value:
             raise ValueError(
-                f"{path} holds a run with {name}={was.get(name)!r}, and now {name}={now[name]!r} is asked for:"
-                " choose another folder, or the same variant and settings"
+                f"{path} was made with {prefix}{name}={was[name]!r}, now {prefix}{name}={value!r}"
+                " is asked for: choose another folder, or the same settings"
             )
+
+
+# The purposes that random numbers are drawn for. Each has its own stream; append, never reorder.
+STREAMS = (
+    "tracks", "random driver", "agent driver", "order", "init", "vae", "mdn_rnn", "evolution",
+    "heldout",
+    "bootstrap",
+)  # fmt: skip
+
+
+def random_stream(purpose: str, seed: int, *numbers: int) -> np.random.Generator:
+    """The Generator of one purpose: equal arguments give equal numbers, others independent ones."""
+    key = (STREAMS.index(purpose), *numbers)
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
 PRESETS = {
     # The whole pipeline in under a minute: shows that everything works, teaches the car nothing.
-    "quick": Settings(
-        name="quick",
-        episodes=8,
-        episode_frames=60,
-        width=8,
-        v_steps=40,
-        v_batch=32,
-        hidden_size=24,
-        m_steps=20,
-        m_batch=8,
-        m_sequence=24,
-        generations=4,
-        population=4,
-        sigma_decay=0.0,
-        components=0,
-        max_frames=60,
-        cars=4,
-        validate_every=2,
-        validation_tracks=2,
+    "quick": Config(
+        data=DataConfig(episodes=8, episode_frames=60, agent_frames=60),
+        vae=VAEConfig(width=8, steps=40, batch=32),
+        mdn_rnn=MDNRNNConfig(hidden_size=24, steps=20, batch=8, sequence=24),
+        evolution=EvolutionConfig(
+            generations=4,
+            population=4,
+            sigma_decay=0.0,
+            components=0,
+            max_frames=60,
+            cars=4,
+            validate_every=2,
+            validation_tracks=2,
+        ),
     ),
     # A car that drives, in less than half an hour on two fast cores.
-    "laptop": Settings(),
-    # The budget that the paper states, with World Models' sizes and loss, and its passes over the data: one for V,
-    # twenty for M. What the paper leaves open is our reading: one episode for each agent, for example.
-    "paper": Settings(
-        name="paper",
-        episodes=1000,
-        episode_frames=1000,
-        random_starts=0.0,
-        width=32,
-        kl_weight=1.0,
-        free_bits=0.5,
-        v_steps=10000,
-        v_batch=100,
-        m_steps=800,
-        m_batch=50,
-        m_sequence=500,
-        m_learning_rate=1e-3,
-        generations=600,
-        population=8,
-        sigma_decay=0.0,
-        components=0,
-        initial_gas=0.0,
-        patience=0,
-        validate_every=20,
-        averaged_share=0.0,
+    "laptop": Config(),
+    # The budget that the paper states, with World Models' sizes and loss, and its passes over the
+    # data: one for V, twenty for M. The paper does not say how many episodes an agent drives; one
+    # is our reading.
+    "paper": Config(
+        data=DataConfig(episodes=1000, episode_frames=1000, random_starts=0.0),
+        vae=VAEConfig(width=32, kl_weight=1.0, free_bits=0.5, steps=10000, batch=100),
+        mdn_rnn=MDNRNNConfig(steps=800, batch=50, sequence=500, learning_rate=1e-3),
+        evolution=EvolutionConfig(
+            generations=600,
+            population=8,
+            sigma_decay=0.0,
+            components=0,
+            initial_gas=0.0,
+            patience=0,
+            validate_every=20,
+            averaged_share=0.0,
+        ),
     ),
 }

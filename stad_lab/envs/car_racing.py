@@ -32,8 +32,8 @@ import pygame
 from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
 
-OBSERVATION_SIZE = 96  # pixels, width and height of an observation
-BAR_TOP = 84  # the first row of the indicator bar: 5/40 of the height is bar
+from stad_lab.envs.frames import BAR_TOP, OBSERVATION_SIZE
+
 MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 TRACK_WIDTH = reference.TRACK_WIDTH  # half the width of the road, world units
 

@@ -166,11 +166,23 @@ def checksum(content: bytes) -> str:
 
 
 def save_json(path: Path, value: dict) -> None:
-    """Write a dict as JSON, atomically, with a checksum of the rest as its last entry."""
+    """Write a dict as JSON, atomically, with a checksum of the rest as its last entry.
+
+    Each entry has a line, and so has each element of a list of dicts.
+    """
     value = {name: part for name, part in value.items() if name != CHECKSUM}
-    write_bytes(
-        path, (json.dumps(value | {CHECKSUM: checksum_of_json(value)}, indent=1) + "\n").encode()
-    )
+    lines = [
+        f"{json.dumps(name)}: {layout(part)}"
+        for name, part in (value | {CHECKSUM: checksum_of_json(value)}).items()
+    ]
+    write_bytes(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
+
+
+def layout(part: Any) -> str:
+    """One entry of a file as JSON."""
+    if isinstance(part, list) and part and isinstance(part[0], dict):
+        return "[\n" + ",\n".join(f" {json.dumps(element)}" for element in part) + "\n]"
+    return json.dumps(part)
 
 
 def checksum_of_json(value: Any) -> str:
@@ -202,11 +214,11 @@ def damaged(path: Path, reason: str, remedy: str) -> ValueError:
     return ValueError(f"{path} is damaged ({reason}): delete it and {remedy}")
 
 
-def save_tensors(path: Path, tensors: dict[str, torch.Tensor], **facts) -> None:
-    """Write tensors as safetensors, atomically, with `facts` (anything JSON can say) and a checksum in its header."""
+def save_tensors(path: Path, tensors: dict[str, torch.Tensor], **metadata) -> None:
+    """Write tensors as safetensors, atomically, with `metadata` (anything JSON can say) and a checksum in its header."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     # In one entry: safetensors writes several in any order, and the same content should be the same bytes.
-    said = json.dumps(facts | {CHECKSUM: checksum_of_tensors(tensors, json.dumps(facts))})
+    said = json.dumps(metadata | {CHECKSUM: checksum_of_tensors(tensors, json.dumps(metadata))})
     write_bytes(path, save(tensors, metadata={KIND: said}))
 
 
@@ -221,7 +233,7 @@ def checksum_of_tensors(tensors: dict[str, torch.Tensor], said: str = "") -> str
 
 
 def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, torch.Tensor], dict]:
-    """Read what `save_tensors` wrote: (tensors, facts).
+    """Read what `save_tensors` wrote: (tensors, metadata).
 
     Raises:
         FileNotFoundError: no such file; the message carries the remedy.
@@ -232,17 +244,17 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     try:
         tensors = load(content)
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        facts = json.loads(header.get("__metadata__", {}).get(KIND, "null"))
+        metadata = json.loads(header.get("__metadata__", {}).get(KIND, "null"))
     except Exception as error:  # the parser meets bytes of any kind, and has many ways to say so
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
-    if not isinstance(facts, dict):
+    if not isinstance(metadata, dict):
         raise ValueError(
             f"{path} was not written by stad_lab: give a file that `python -m stad_lab train` made"
         )
-    wanted = facts.pop(CHECKSUM, None)
-    if checksum_of_tensors(tensors, json.dumps(facts)) != wanted:
+    wanted = metadata.pop(CHECKSUM, None)
+    if checksum_of_tensors(tensors, json.dumps(metadata)) != wanted:
         raise damaged(path, "it does not hold what its checksum was made of", remedy)
-    return tensors, facts
+    return tensors, metadata
 
 
 def load_into(module: torch.nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
