@@ -57,7 +57,7 @@ def load_vae(path: Path) -> tuple[VAE, dict]:
         FileNotFoundError: no such file.
         ValueError: damaged, or not V.
     """
-    tensors, metadata = load_kind(path, "vae", "variant", "vae", "crop_bar", "checksum", "history")
+    tensors, metadata = load_kind(path, "vae", "variant", "vae", "crop_bar", "weights", "history")
     vae = VAE(metadata["variant"], metadata["vae"]["latent_size"], metadata["vae"]["width"])
     load_into(vae.to(memory_format=torch.channels_last), tensors, path)
     return vae.eval().requires_grad_(False), metadata
@@ -76,7 +76,7 @@ def save_mdn_rnn(
 
 def load_mdn_rnn(path: Path) -> tuple[MDNRNN, dict]:
     """Read M: (the MDN-RNN in evaluation mode, its metadata). Raises as `load_vae`."""
-    tensors, metadata = load_kind(path, "mdn_rnn", "latent_size", "mdn_rnn", "vae", "checksum")
+    tensors, metadata = load_kind(path, "mdn_rnn", "latent_size", "mdn_rnn", "vae", "weights")
     sizes = metadata["mdn_rnn"]["hidden_size"], metadata["mdn_rnn"]["mixtures"]
     mdn_rnn = MDNRNN(metadata["latent_size"], *sizes)
     load_into(mdn_rnn, tensors, path)
@@ -118,7 +118,7 @@ def check_kind(path: Path, metadata: dict, kind: str) -> None:
 
 def described(kind: str, weights: dict[str, torch.Tensor]) -> dict:
     """The kind and the checksum of some weights, for their metadata."""
-    return {"kind": kind, "checksum": checksum_of_tensors(weights)}
+    return {"kind": kind, "weights": checksum_of_tensors(weights)}
 
 
 def check_belongs(path: Path, metadata: dict, **checksums: str) -> None:
@@ -148,7 +148,7 @@ def read_world_model(folder: Path, times: tuple[int, int]) -> WorldModel:
     """`load_world_model`, kept for files with the same modification times."""
     vae, v_metadata = load_vae(folder / VAE_FILE)
     mdn_rnn, m_metadata = load_mdn_rnn(folder / MDN_RNN_FILE)
-    check_belongs(folder / MDN_RNN_FILE, m_metadata, vae=v_metadata["checksum"])
-    checksums = {"vae": v_metadata["checksum"], "mdn_rnn": m_metadata["checksum"]}
+    check_belongs(folder / MDN_RNN_FILE, m_metadata, vae=v_metadata["weights"])
+    checksums = {"vae": v_metadata["weights"], "mdn_rnn": m_metadata["weights"]}
     stride, crop_bar = v_metadata["vae"]["stride"], v_metadata["crop_bar"]
     return WorldModel(vae, mdn_rnn, stride, crop_bar, checksums)
