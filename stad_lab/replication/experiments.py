@@ -1,158 +1,187 @@
-"""The rows of the replication's table: a variant, a recipe and some seeds each.
+"""The experiments of the replication: a variant, a configuration and some seeds each.
 
-`stad_lab.replication.run` makes them, and `stad_lab.replication.tables` says what came out.
+`stad_lab.replication.run` carries them out; `stad_lab.replication.claims` says what came of them.
+All of them were run with pycma 4.5, which adapts sigma by two points (TPA) from 300 searched
+dimensions on and by cumulative path length (CSA) below. The configurations say which.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from stad_lab.config import Settings
-from stad_lab.models.vae import VARIANTS
-from stad_lab.training.fine_tuning import FINISH
+from stad_lab.config import VARIANTS, Config
 
-FLOORS = {  # rows of drivers that do not look at the road
-    "random_driver": "smooth random steering and gas, as for the rollouts",
-    "gentle_driver": "straight on with little gas, as the first agent that evolution tries",
+BASELINE_DRIVERS = {  # drivers that do not see the road, and have no seeds
+    "random_driver": "smooth random steering and gas, as in the dataset",
+    "constant_driver": "straight on with little gas, as the first controller of CMA-ES",
 }
-EARLY = (0, 1, 2, 3, 4)  # seeds of the rows whose runs are short, and whose scores scatter the most
-NO_BAR_SEEDS = (0, 1)
+RECIPES = {  # experiments RECIPE_VARIANT, for all four variants
+    "paper": "the paper's recipe, one episode per agent",
+    "two_iterations": "two iterations of the world model",
+    "fine_tuned": "two iterations and fine-tuning",
+    "first_iteration": "the first of the two iterations",
+    "no_bar": "one iteration, without the indicator bar",
+}
+FINE_TUNING = {
+    "evolution": {
+        "generations": 15,
+        "population": 32,
+        "tracks": 8,
+        "replay_share": 0.5,
+        "sigma": 0.02,
+        "sigma_decay": 0.97,
+        "validate_every": 5,
+        "averaged_share": 0.5,
+    }
+}
 
 
 @dataclass(frozen=True)
-class Row:
-    """One row of the table."""
+class Experiment:
+    """What is run for one line of the results."""
 
-    variant: str
     about: str
-    """What is special about it, for the reader."""
-    settings: Settings
-    """Of the only round, of the second, or of the finish."""
-    first: Settings | None = None
-    """Of the first round, in a recipe of two."""
+    """What is special about it."""
+    config: Config
+    """Of the only iteration, of the second one, or of the fine-tuning."""
+    first: Config | None = None
+    """Of the first iteration of the world model, where there are two."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the searches for C. V and M, and a first round, are made once."""
-    world: str | None = None
-    """Name of the row whose rollouts, V and M it shares; None for its own."""
+    """Of the CMA-ES runs. V and M, and a first iteration, are trained once for all of them."""
+    world_model: str | None = None
+    """The experiment whose dataset, V and M it shares; None for its own."""
     base: str | None = None
-    """Name of the row whose searches it goes on from, seed by seed, with a finish."""
+    """The experiment whose runs it fine-tunes, seed by seed."""
     retrained: bool = False
-    """Whether each seed is a whole run, with rollouts, V and M of its own."""
+    """Whether each seed is a whole run, with its own dataset, V and M."""
 
-    def settings_of(self, seed: int) -> Settings:
-        """The settings of one of its seeds."""
-        return dataclasses.replace(
-            self.settings, evolution_seed=seed, seed=seed if self.retrained else self.settings.seed
-        )
+    @property
+    def variant(self) -> str:
+        """What V sees and reconstructs."""
+        return self.config.variant
+
+    def config_of(self, seed: int) -> Config:
+        """The configuration of one seed."""
+        own = seed if self.retrained else self.config.seed
+        return self.config.replace(seed=own, evolution={"seed": seed})
 
 
-def make_rows() -> dict[str, Row]:
-    """All rows of the table by name."""
-    rows = {}
+def recipe_experiments() -> dict[str, Experiment]:
+    """The recipes that are run with all four variants, and the longer run of one of them."""
+    found = {}
+    second = {
+        "data": {"agent_episodes": 110},
+        "evolution": {"generations": 40, "sigma": 0.05, "replay_share": 0.5},
+    }
     for variant in VARIANTS:
-        rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
-    # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
-    one = Settings.preset("laptop", crop_bar=False)
-    # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
-    first = dataclasses.replace(one, generations=15)
-    second = dataclasses.replace(
-        first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5
-    )
-    for variant in VARIANTS:
-        rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
-    # Before the ceiling: 900 + 15 x 64 + 3 x 16 = 1,908 episodes.
-    for variant in VARIANTS:
-        rows[f"early_{variant}"] = Row(
-            variant, "the first round of our recipe", first, seeds=EARLY, retrained=True
-        )
-    # 15 x 256 + 3 x 16 episodes more, and 480 agents: 8,594 episodes and 4,000 agents in all.
-    finished = dataclasses.replace(second, **FINISH)
-    for variant in VARIANTS:
-        base = f"two_rounds_{variant}"
-        rows[f"finished_{variant}"] = Row(variant, "our recipe and a finish", finished, base=base)
-    longer = dataclasses.replace(second, generations=160, sigma_decay=0.99)
-    rows["long_input"] = Row(
-        "input", "our recipe, four times as long", longer, first, (0,), "two_rounds_input"
-    )
-    never_back = dataclasses.replace(second, revisited_share=0.0)
-    rows["two_rounds_new_tracks"] = Row(
-        "input", "our recipe, new tracks alone", never_back, first, seeds=(0,)
-    )
-    before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]
-    rows["two_rounds_few_agents"] = Row(
-        "input", "our recipe before it was improved", *before, seeds=(0,)
-    )
-    rows["one_round"] = Row("input", "one round", one)
-    for name, (about, changes, world) in ABLATIONS.items():
-        settings = dataclasses.replace(rows[world or "one_round"].settings, **changes)
-        rows[name] = Row("input", about, settings, seeds=(0,), world=world)
-    # What counts there is the luck of V, so each seed has its own.
-    rows["no_bar"] = dataclasses.replace(rows["no_bar"], seeds=NO_BAR_SEEDS, retrained=True)
-    for variant, what in NO_BAR.items():
-        about = f"{rows['no_bar'].about}, {what}"
-        rows[f"no_bar_{variant}"] = dataclasses.replace(
-            rows["no_bar"], variant=variant, about=about
-        )
-    return rows
+        own = {"variant": variant}
+        paper = Config.preset("paper", **own, evolution={"step_size_rule": "TPA"})
+        one = Config.preset("laptop", **own, data={"crop_bar": False})
+        first = one.replace(evolution={"generations": 15})
+        two = first.replace(**second)
+        recipes = {
+            "paper": {"config": paper},
+            "two_iterations": {"config": two, "first": first},
+            "fine_tuned": {
+                "config": two.replace(**FINE_TUNING),
+                "base": f"two_iterations_{variant}",
+            },
+            "first_iteration": {"config": first, "seeds": (0, 1, 2, 3, 4), "retrained": True},
+            "no_bar": {
+                "config": Config.preset("laptop", **own),
+                "seeds": (0, 1),
+                "retrained": True,
+            },
+        }
+        for name, fields in recipes.items():
+            found[f"{name}_{variant}"] = Experiment(RECIPES[name], **fields)
+    return found
 
 
-# Our recipe before it was improved.
-BEFORE = {
-    "population": 16,
-    "tracks": 4,
-    "revisited_share": 0.0,
-    "components": 0,
-    "sigma_decay": 0.0,
-    "crop_bar": True,
-}
-# Name -> what it is, the change, and the row that it changes and whose V and M it shares; None for "one_round" with a
-# V and an M of its own. V and M of "one_round" come from a kind of processor that not everybody has, and without them
-# a row could be compared with nothing: so "another_V" is the same recipe, made where the rows that share it are made.
-ABLATIONS = {
-    "no_M": ("one round, C sees z alone", {"features": "z"}, "one_round"),
-    "no_z": ("one round, C sees h alone", {"features": "h"}, "one_round"),
-    "untrained_M": ("one round, M's weights are random", {"m_steps": 0}, "one_round"),
-    "few_agents": (
-        "one round, 16 agents on 4 tracks each",
-        {"population": 16, "tracks": 4},
-        "one_round",
+def changed_experiments(recipes: dict[str, Experiment]) -> dict[str, Experiment]:
+    """Experiments that change one thing, all with the variant `input`."""
+    two = recipes["two_iterations_input"]
+    one = Experiment("one iteration", two.first.replace(evolution={"generations": 55}))
+    found = {"one_iteration": one}
+    for name, (about, changes, shared) in CHANGES.items():
+        config = found[shared or "one_iteration"].config.replace(**changes)
+        found[name] = Experiment(about, config, seeds=(0,), world_model=shared)
+    for name, (about, changes, both) in TWO_ITERATIONS_CHANGES.items():
+        first = two.first.replace(**changes) if both else two.first
+        shared = "two_iterations_input" if name == "long_two_iterations" else None
+        found[name] = Experiment(about, two.config.replace(**changes), first, (0,), shared)
+    return found
+
+
+# Name -> what it is, the change, and the experiment whose V and M it shares (None: its own).
+CHANGES = {
+    "z_only": ("C sees z alone", {"evolution": {"features": "z"}}, "one_iteration"),
+    "h_only": ("C sees h alone", {"evolution": {"features": "h"}}, "one_iteration"),
+    "untrained_mdn_rnn": ("M is not trained", {"mdn_rnn": {"steps": 0}}, "one_iteration"),
+    "small_population": (
+        "16 agents on 4 tracks each",
+        {"evolution": {"population": 16, "tracks": 4}},
+        "one_iteration",
     ),
-    "another_V": ("one round, all of it from another seed", {"seed": 1}, None),
-    "last_mean": ("one round, the last CMA mean alone", {"averaged_share": 0.0}, "another_V"),
-    "every_weight": ("one round, every weight of C searched", {"components": 0}, "another_V"),
-    "own_sigma": ("one round, CMA-ES's own step size", {"sigma_decay": 0.0}, "another_V"),
-    "no_bar": (
-        "one round, the indicator bar cut off: the laptop settings",
-        {"crop_bar": True},
-        None,
+    "another_seed": ("everything from another seed", {"seed": 1}, None),
+    "last_mean": (
+        "the last CMA mean, not an average",
+        {"evolution": {"averaged_share": 0.0}},
+        "another_seed",
     ),
-    **{f"stride_{k}": (f"one round, stride {k}", {"stride": k}, None) for k in (1, 2, 8)},
-    **{f"latent_{n}": (f"one round, {n} latents", {"latent_size": n}, None) for n in (16, 64)},
+    "all_weights": (
+        "every weight of C searched",
+        {"evolution": {"components": 0, "step_size_rule": "TPA"}},
+        "another_seed",
+    ),
+    "adaptive_sigma": (
+        "step size adapted by CMA-ES",
+        {"evolution": {"sigma_decay": 0.0}},
+        "another_seed",
+    ),
+    **{f"stride_{k}": (f"stride {k}", {"vae": {"stride": k}}, None) for k in (1, 2, 8)},
+    **{f"latent_{n}": (f"{n} latents", {"vae": {"latent_size": n}}, None) for n in (16, 64)},
 }
-# Variant of the "no_bar" recipe -> what V does with the difference image. With `input`, as "no_bar" is, it sees it.
-NO_BAR = {
-    "frame": "and no difference images",
-    "output": "and the difference image redrawn, not seen",
-    "input_output": "and the difference image seen and redrawn",
+# The same for two iterations; the last entry says whether the first iteration changes as well.
+TWO_ITERATIONS_CHANGES = {
+    "long_two_iterations": (
+        "two iterations, four times as long",
+        {"evolution": {"generations": 160, "sigma_decay": 0.99}},
+        False,
+    ),
+    "no_replay": ("two iterations, new tracks only", {"evolution": {"replay_share": 0.0}}, False),
+    "early_recipe": (
+        "two iterations, before the recipe was improved",
+        {
+            "data": {"crop_bar": True},
+            "evolution": {
+                "population": 16,
+                "tracks": 4,
+                "replay_share": 0.0,
+                "components": 0,
+                "sigma_decay": 0.0,
+                "step_size_rule": "TPA",
+            },
+        },
+        True,
+    ),
 }
-ROWS = make_rows()
+RECIPE_EXPERIMENTS = recipe_experiments()
+EXPERIMENTS = RECIPE_EXPERIMENTS | changed_experiments(RECIPE_EXPERIMENTS)
 
 
-def is_floor(name: str, seeds: Sequence[int] | None = None) -> bool:
-    """Whether a row is one of FLOORS. Raises ValueError if seeds are wanted of one, since it has none."""
-    if name in FLOORS and seeds:
-        raise ValueError(f"row {name!r} is no search and has no seeds: leave them out")
-    return name in FLOORS
+def find_experiment(name: str, seeds: Sequence[int] | None = None) -> Experiment:
+    """The experiment of a name, reduced to `seeds` if they are given.
 
-
-def find_row(name: str, seeds: Sequence[int] | None = None) -> Row:
-    """The row of a name, if wanted with some of its seeds alone. Raises ValueError if there is no such row or seed."""
-    if name not in ROWS:
-        raise ValueError(f"unknown row {name!r}: choose one of {', '.join([*ROWS, *FLOORS])}")
-    row = ROWS[name]
-    for seed in seeds or ():
-        if seed not in row.seeds:
-            raise ValueError(
-                f"row {name!r} has no seed {seed}: choose of {', '.join(map(str, row.seeds))}"
-            )
-    return dataclasses.replace(row, seeds=tuple(dict.fromkeys(seeds))) if seeds else row
+    Raises:
+        ValueError: no such experiment, or it has no such seed.
+    """
+    if name not in EXPERIMENTS:
+        known = ", ".join([*EXPERIMENTS, *BASELINE_DRIVERS])
+        raise ValueError(f"unknown experiment {name!r}: choose one of {known}")
+    found = EXPERIMENTS[name]
+    if unknown := [seed for seed in seeds or () if seed not in found.seeds]:
+        raise ValueError(
+            f"experiment {name!r} has no seed {unknown[0]}: choose from {list(found.seeds)}"
+        )
+    return dataclasses.replace(found, seeds=tuple(dict.fromkeys(seeds))) if seeds else found

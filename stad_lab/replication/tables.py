@@ -1,218 +1,262 @@
-"""The table of the replication: what the records of its rows say, and how sure that is.
+"""The measurements of the replication as tidy tables: one CSV file each, which pandas opens.
 
-The records that we report lie in `stad_lab/records/table`, a folder for each row as `stad_lab.replication.run` has it.
+A run is named by `experiment`, `role` and `seed`. The role is "run" (CMA-ES for C, evaluated),
+"first_iteration" (of a recipe with two) or "world_model" (only V and M); the last two serve the run
+of the same seed and those after it, up to the next. C of each run is in `data/controllers`.
 """
 
-import itertools
-from collections import Counter
+import hashlib
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas
 
-from stad_lab.evaluation.evaluate import (
-    RESAMPLES,
-    SOLVED,
-    bootstrap,
-    draw_tracks,
-    middle_95,
-    resampled_means,
-    summarise,
-)
-from stad_lab.io.files import load_json
-from stad_lab.replication.experiments import FLOORS, ROWS
-from stad_lab.training.evolution import LOG
-from stad_lab.training.pipeline import total_budget
+from stad_lab.config import VARIANTS, Config
+from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
 
-RECORDS = Path(__file__).parents[1] / "records" / "table"
-# World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
-WORLD_MODELS = {
-    25 * 64 * 16: 823.0,
-    50 * 64 * 16: 867.0,
-    200 * 64 * 16: 880.0,
-    1800 * 64 * 16: 900.5,
+DATA = Path(__file__).parent / "data"
+TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
+KEYS = {  # table -> the columns that name a line, all others are values
+    "episodes": ("experiment", "seed", "track"),
+    "fast_episodes": ("agent", "processor", "track"),
+    "generations": ("experiment", "role", "seed", "generation"),
+    "runs": ("experiment", "role", "seed"),
+    "histories": ("experiment", "role", "seed", "network", "step", "data"),
+    "probe": ("world_model", "seed", "driver", "features", "quantity"),
+    "model_metrics": ("model", "world_model", "metric", "index"),
+    "speed": ("part", "measure", "condition", "round"),
+    "provenance": ("table", "source"),
 }
-PAPER = {
-    "frame": 827.0,
-    "input": 905.0,
-    "output": 906.0,
-    "input_output": 902.0,
-}  # its table, on CarRacing-v0
-OTHERS = {  # the rest of that table
-    "Task-aware AE": 200.0,
-    "DQN": 343.0,
-    "DDPG": 100.0,
-    "A3C, continuous": 591.0,
-    "A3C, discrete": 652.0,
-    "OpenAI": 838.0,
-    "World Models": 906.0,
+VALUES = {  # table -> the columns that it must have besides, and that are never empty
+    "episodes": ("return", "frames"),
+    "fast_episodes": ("return", "frames"),
+    "generations": ("worst", "mean", "best", "sigma", "frames"),
+    "runs": ("variant", "commit"),
+    "histories": ("total",),
+    "probe": ("variant", "trained", "indicator_bar", "r2", "low", "high"),
+    "model_metrics": ("value",),
+    "speed": ("value",),
+    "provenance": ("commit",),
 }
-RECIPES = {  # rows RECIPE_VARIANT, and what the picture of the replication calls them
-    "paper": "the paper's recipe here, v3",
-    "two_rounds": "our recipe, v3",
-    "finished": "ours, finished",
-}
-PAPER_BEST = {"best agent": 929.82, "best generation": 911.73}  # the highest points of its figures
-TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
+FLOATS = ("return", "worst", "mean", "best", "value")  # although all may be whole numbers
+UNITS = ("agents", "episodes", "frames")
 
 
-def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
-    """The rows that have been made: name -> folders of its finished seeds, in the order of FLOORS and ROWS."""
-    found = {
-        name: [seed for seed in seed_folders(records / name) if (seed / "evaluation.json").exists()]
-        for name in [*FLOORS, *ROWS]
-    }
-    return {name: folders for name, folders in found.items() if folders}
+def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
+    """Read a table, exact to the last bit of each number.
+
+    Raises:
+        ValueError: a column is missing or has gaps, or a line is there twice.
+    """
+    path = folder / f"{name}.csv"
+    table = pandas.read_csv(path, float_precision="round_trip", low_memory=False)
+    needed = [*KEYS[name], *VALUES[name]]
+    if missing := [column for column in needed if column not in table]:
+        raise ValueError(f"{path} has no column {', '.join(missing)}")
+    if gaps := [column for column in needed if table[column].isna().any()]:
+        raise ValueError(f"{path} has empty cells in {', '.join(gaps)}")
+    if (twice := table.duplicated(list(KEYS[name]))).any():
+        line = ", ".join(map(str, table.loc[twice, list(KEYS[name])].iloc[0]))
+        raise ValueError(f"{path} has two lines for {line}")
+    return table
 
 
-def seed_folders(row: Path) -> list[Path]:
-    """The folders `seed0`, `seed1` and so on of a row; not a `seed0_old` beside them, which would count twice."""
-    return sorted(path for path in row.glob("seed*") if path.name.removeprefix("seed").isdecimal())
+def episodes(folder: Path = DATA) -> pandas.DataFrame:
+    """The evaluation of each run: `return` and `frames` on every official track.
+
+    Raises:
+        ValueError: as `read`, or a run that was not evaluated on just the tracks 0 to 99.
+    """
+    table = read("episodes", folder)
+    for (experiment, seed), run in table.groupby(["experiment", "seed"]):
+        if sorted(run["track"]) != list(range(TRACKS)):
+            raise ValueError(f"{experiment}, seed {seed}: expected the tracks 0 to {TRACKS - 1}")
+    return table
 
 
-def describe_table(rows: dict[str, list[Path]]) -> str:
-    """The table of the replication, in Markdown: a line for each of the rows of `kept_rows`."""
-    lines = [
-        "| row | seeds | V, M | mean of 100 tracks | 95% interval | above 900 | agents | episodes | frames |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, folders in rows.items():
-        found, planned = summarise_row(folders), len(ROWS[name].seeds) if name in ROWS else 1
-        seeds = f"{len(folders)} of {planned}" if len(folders) < planned else f"{len(folders)}"
-        low, high = found["interval"]
+def returns_of(table: pandas.DataFrame, column: str = "return") -> dict[str, np.ndarray]:
+    """Experiment -> its returns, or another column of `episodes`: (seeds, tracks)."""
+    wide = table.pivot(index=["experiment", "seed"], columns="track", values=column)
+    return {name: wide.loc[name].to_numpy() for name in table["experiment"].unique()}
+
+
+def fitness(run: str, folder: Path = DATA) -> dict[str, np.ndarray]:
+    """All returns of a CMA-ES run, named as by `key`.
+
+    Returns:
+        "returns" float64 (generations, agents, tracks), "tracks" int (generations, tracks) and
+        "validation" float64 (validations, tracks).
+    """
+    with np.load(folder / "fitness.npz") as file:
+        return {part: file[f"{run}/{part}"] for part in ("returns", "tracks", "validation")}
+
+
+def key(experiment: str, seed: int, role: str = "run") -> str:
+    """The name of a run in file names: "paper_frame-0", "two_iterations_frame-0-first_iteration"."""
+    return f"{experiment}-{seed}" + f"-{role}" * (role != "run")
+
+
+def add_run(
+    folder: Path, experiment: str, seed: int, to: Path = DATA, role: str = "run"
+) -> None:
+    """Add the records of a finished run to the tables, in place of those that it has there.
+
+    Raises:
+        ValueError: the evaluation is of another variant, renderer, controller or other tracks.
+    """
+    run = {"experiment": experiment, "role": role, "seed": seed}
+    record = load(folder / "record.json")
+    line = run | describe_record(record)
+    if (log_file := folder / "evolution.json").exists():
+        log = load(log_file)
+        line |= {"vae": log["vae"], "mdn_rnn": log["mdn_rnn"]} | flatten(log["best"], "best")
+        add_log(run, log, to)
+    for network in ("vae", "mdn_rnn"):
+        if (weights := folder / f"{network}.safetensors").exists() and role != "run":
+            metadata = read_metadata(weights)
+            line[network] = metadata["weights"]
+            add_history(run | {"network": network}, metadata["history"], to)
+    if (controller := folder / "controller.safetensors").exists():
+        line["controller"] = hashlib.sha256(controller.read_bytes()).hexdigest()
+        copy = to / "controllers" / f"{key(experiment, seed, role)}.safetensors"
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(controller, copy)
+    if (evaluation_file := folder / "evaluation.json").exists():
+        evaluation = load(evaluation_file)
+        check_evaluation(evaluation_file, evaluation, experiment, line.get("controller"))
+        line["seconds.evaluation"] = evaluation["seconds"]
+        driven = pandas.DataFrame(evaluation["episodes"])
+        replace_lines("episodes", driven.assign(experiment=experiment, seed=seed), to)
+    replace_lines("runs", pandas.DataFrame([line]), to)
+
+
+def check_evaluation(path: Path, found: dict, experiment: str, controller: str | None) -> None:
+    """Raise ValueError unless an evaluation is the official one of this experiment's agent."""
+    driver = experiment in BASELINE_DRIVERS
+    variant = experiment if driver else EXPERIMENTS[experiment].variant
+    tracks = [episode["track"] for episode in found["episodes"]]
+    for name, value, wanted in (
+        ("variant", found["variant"], variant),
+        ("renderer", found["renderer"], found["renderer"] if driver else "gymnasium"),
+        ("controller", found.get("controller"), controller),
+        ("tracks", sorted(tracks), list(range(TRACKS))),
+    ):
+        if value != wanted:
+            raise ValueError(f"{path}: {name} is {value}, expected {wanted}")
+
+
+def describe_record(record: dict) -> dict:
+    """The line of `runs` for a record: settings, machine, times and budget, with dotted names."""
+    line = {"variant": record["variant"], **flatten(record.get("config", {}), "config")}
+    line.pop("config.variant", None)
+    line |= record["made_with"]
+    line["continued_with"] = " ".join(one["commit"] for one in record.get("continued_with", []))
+    line |= flatten(record.get("seconds", {}), "seconds") | flatten(record["budget"], "budget")
+    for stage, starts in record.get("peak_memory", {}).items():
+        for process in starts[0]:
+            line[f"megabytes.{stage}.{process}"] = max(start[process] for start in starts)
+    return line | flatten(total_budget(record), "total")
+
+
+def total_budget(record: dict) -> dict[str, int]:
+    """Agents, episodes and frames of a run and of the runs before it that it continues.
+
+    A second iteration drives the random episodes of the first once more; they count once.
+    """
+    parts = [part for part in record["budget"].values() if isinstance(part, dict)]
+    total = {unit: sum(part[unit] for part in parts) for unit in ("episodes", "frames")}
+    total["agents"] = record["budget"].get("agents", 0)
+    if "earlier" in record:
+        same = same_random_episodes(record["config"], record["earlier"]["config"])
+        again = record["budget"]["random"] if same else {}
+        before = total_budget(record["earlier"])
+        total = {unit: total[unit] + before[unit] - again.get(unit, 0) for unit in UNITS}
+    return total
+
+
+def same_random_episodes(one: dict, other: dict) -> bool:
+    """Whether two configurations collect the same episodes with the random driver."""
+    names = ("episodes", "episode_frames", "random_starts", "crop_bar")
+    return one["seed"] == other["seed"] and all(one["data"][n] == other["data"][n] for n in names)
+
+
+def add_log(run: dict, log: dict, to: Path) -> None:
+    """Add the log of a CMA-ES run to `generations` and to the compact file of all returns."""
+    lines, entries = [], log["generations"]
+    for entry in entries:
+        means = np.mean(entry["returns"], axis=1)
+        validation = entry.get("validation", {})
         lines.append(
-            f"| `{name}` | {seeds} | {found['worlds']} | {found['mean']:.1f} | {low:.1f} to {high:.1f}"
-            f" | {found['above_900']:.0%} | {found['agents']:,.0f} | {found['episodes']:,.0f}"
-            f" | {found['frames'] / 1e6:.2f} M |"
+            run
+            | {name: entry[name] for name in ("generation", "frames", "sigma", "mean_checksum")}
+            | {"worst": means.min(), "mean": means.mean(), "best": means.max()}
+            | {"validation": validation.get("mean")}
+            | {f"validation_{name}": validation.get(name) for name in ("frames", "controller_checksum")}
         )
-    return "\n".join(lines)
-
-
-def claims_and_outcomes(
-    rows: dict[str, list[Path]],
-) -> dict[str, dict[str, tuple[float, list[float], list[float]]]]:
-    """What the paper reports of each variant, and what came out here.
-
-    Returns:
-        variant -> "the paper, v0" or a name of RECIPES -> (mean return, its 95% interval, the mean of each search), for
-        the rows that are made. The paper gives neither interval nor searches.
-    """
-    scores = {
-        variant: {"the paper, v0": (claim, [claim, claim], [])} for variant, claim in PAPER.items()
+    replace_lines("generations", pandas.DataFrame(lines), to)
+    path, name = to / "fitness.npz", key(**run)
+    kept = dict(np.load(path)) if path.exists() else {}
+    validated = [entry["validation"]["returns"] for entry in entries if "validation" in entry]
+    kept |= {
+        f"{name}/returns": np.array([entry["returns"] for entry in entries]),
+        f"{name}/tracks": np.array([entry["tracks"] for entry in entries]),
+        f"{name}/validation": np.array(validated),
     }
-    for variant, (recipe, told) in itertools.product(PAPER, RECIPES.items()):
-        if f"{recipe}_{variant}" in rows:
-            returns = official_returns(rows[f"{recipe}_{variant}"])
-            scores[variant][told] = (
-                float(returns.mean()),
-                bootstrap(returns),
-                returns.mean(axis=1).tolist(),
-            )
-    return scores
+    np.savez_compressed(path, **{name: kept[name] for name in sorted(kept)})
 
 
-def stage_times(row: Path) -> dict[str, float]:
-    """How long the stages of a row took, from nothing to the evaluated agent of seed 0, in seconds.
-
-    Args:
-        row: folder of a row that has a world of its own. The stages of a first round count too.
-
-    Returns:
-        "rollouts", "autoencoder", "mdn_rnn", "controller" and "evaluation" -> seconds.
-    """
-    times: Counter[str] = Counter()
-    for part in ("first", "world", "seed0") if (row / "first").exists() else ("world", "seed0"):
-        times.update(load_json(row / part / "record.json")["seconds"])
-    return dict(times) | {"evaluation": load_json(row / "seed0" / "evaluation.json")["seconds"]}
+def read_metadata(path: Path) -> dict:
+    """What a file of weights says about itself."""
+    content = path.read_bytes()
+    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    return json.loads(header["__metadata__"]["stad_lab"])
 
 
-def lost_points(folders: list[Path]) -> dict[str, float]:
-    """Where the points up to 1,000 went, mean of all episodes: 1,000 less the sum of the parts is the mean return.
-
-    Returns:
-        "speed": 0.1 for each frame of a lap, had every episode been a complete lap at the mean time of those that were.
-        "waiting": 0.1 for each frame more. A lap ends when all tiles are visited, so that one missed tile prolongs the
-        episode to its last frame; only leaving the field shortens it. "tiles": those not visited, and the 100 points
-        for leaving the field.
-    """
-    episodes = [
-        episode
-        for folder in folders
-        for episode in load_json(folder / "evaluation.json")["episodes"]
+def add_history(network: dict, history: list[dict], to: Path) -> None:
+    """Add the losses of a network's training to `histories`."""
+    lines = [
+        network | {"step": entry["step"], "data": data} | entry[data]
+        for entry in history
+        for data in ("train", "heldout")
     ]
-    returns, frames = (
-        np.array([episode[name] for episode in episodes]) for name in ("return", "frames")
-    )
-    laps = frames[
-        returns >= SOLVED
-    ]  # 1,000 frames at most, so 900 points at least; and with a tile missing, fewer
-    speed = laps.mean() if len(laps) else frames.mean()
-    return {
-        "speed": float(0.1 * speed),
-        "waiting": float(0.1 * (frames.mean() - speed)),
-        "tiles": float((1000 - returns - 0.1 * frames).mean()),
-    }
+    replace_lines("histories", pandas.DataFrame(lines), to)
 
 
-def learning_curve(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The scores on the validation tracks of one seed, and how many episodes had been driven for each: two (looks,).
-
-    All episodes count: the random driver's, those of a first round and of its agent, and the validation itself.
-    """
-    log, record = load_json(folder / LOG)["generations"], load_json(folder / "record.json")
-    own = sum(record["budget"][part]["episodes"] for part in ("evolution", "validation"))
-    driven, episodes, scores = total_budget(record)["episodes"] - own, [], []
-    for entry in log:
-        driven += sum(len(returns) for returns in entry["returns"])
-        if "validation" in entry:
-            driven += len(entry["validation"]["returns"])
-            episodes.append(driven)
-            scores.append(entry["validation"]["mean"])
-    return np.array(episodes), np.array(scores)
+def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
+    """Write a table with new lines in the place of those of the same run."""
+    path = folder / f"{name}.csv"
+    run = [column for column in ("experiment", "role", "seed", "network") if column in lines]
+    table = lines
+    if path.exists():
+        old = read(name, folder)
+        runs = set(lines[run].itertuples(index=False, name=None))
+        kept = [row not in runs for row in old[run].itertuples(index=False, name=None)]
+        table = pandas.concat([old[kept], lines])
+    save(name, table, folder)
 
 
-def summarise_row(folders: list[Path]) -> dict:
-    """What the table shows of a row, from the folders of its seeds.
-
-    Returns:
-        "mean", "standard_deviation" (over all episodes), "interval" (95%, of the mean, over seeds and tracks), "seeds"
-        (the mean of each), "worlds" (how many trainings of V and M are behind them), "above_900" (share of episodes),
-        "top_90" (mean of each seed's best 90 episodes), and the budget of one seed: "agents", "episodes", "frames"
-        (means over the seeds), with all that was driven before it.
-    """
-    returns = official_returns(folders)
-    budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
-    return {
-        **summarise(returns),
-        "seeds": returns.mean(axis=1).tolist(),
-        "worlds": len(worlds(folders)),
-        "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
-        **{
-            unit: float(np.mean([spent[unit] for spent in budgets]))
-            for unit in ("agents", "episodes", "frames")
-        },
-    }
+def save(name: str, table: pandas.DataFrame, folder: Path = DATA) -> None:
+    """Write a table in the order of its keys; floats with all digits, whole numbers without."""
+    keys = list(KEYS[name])
+    table = table[keys + [column for column in table if column not in keys]]
+    for column in table.select_dtypes("float"):
+        if (table[column].dropna() % 1 == 0).all() and column not in FLOATS:
+            table[column] = table[column].astype("Int64")
+    folder.mkdir(parents=True, exist_ok=True)
+    table.sort_values(keys).to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
 
 
-def worlds(folders: list[Path]) -> set[tuple[str, str]]:
-    """The identities of the V's and M's that the searches in some folders had; none of a driver of FLOORS."""
-    logs = [load_json(folder / LOG) for folder in folders if (folder / LOG).exists()]
-    return {(log["autoencoder"], log["mdn_rnn"]) for log in logs}
+def flatten(values: dict, prefix: str) -> dict:
+    """{"a": {"b": 1}} -> {"prefix.a.b": 1}."""
+    found = {}
+    for name, value in values.items():
+        dotted = f"{prefix}.{name}"
+        found |= flatten(value, dotted) if isinstance(value, dict) else {dotted: value}
+    return found
 
 
-def official_returns(folders: list[Path]) -> np.ndarray:
-    """The returns of a row's seeds on the official tracks, float64 (seeds, tracks), from their folders."""
-    evaluations = [load_json(folder / "evaluation.json", "evaluate again") for folder in folders]
-    return np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
-
-
-def bootstrap_gain(
-    before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES
-) -> list[float]:
-    """95% interval of the mean of `after` less the mean of `before`, both returns (seeds, tracks) on the same tracks.
-
-    Seeds are drawn anew for each of the two, tracks once for both: a long track costs both of them time. Of a row with
-    one seed the luck of its search is left out, so that the interval is too narrow.
-    """
-    rng, tracks = draw_tracks(before, resamples)
-    gains = resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks)
-    return middle_95(gains)
+def load(path: Path) -> dict:
+    """Read a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
