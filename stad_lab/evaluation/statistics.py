@@ -11,7 +11,7 @@ RESAMPLES = 10_000  # of a bootstrap
 
 
 def summarise(returns: np.ndarray) -> dict:
-    """Mean, deviation, 95% interval of the mean and share above 900, of (tracks,) or (seeds, tracks)."""
+    """Mean, deviation, interval of the mean and share above 900: (tracks,) or (seeds, tracks)."""
     return {
         "mean": float(returns.mean()),
         "standard_deviation": float(returns.std(ddof=1)) if returns.size > 1 else 0.0,
@@ -21,12 +21,13 @@ def summarise(returns: np.ndarray) -> dict:
 
 
 def describe_tail(returns: np.ndarray) -> dict:
-    """Minimum, tenth percentile, median, and share below 800 of all episodes."""
+    """Minimum, tenth percentile, median, share and number of the episodes below 800."""
     return {
         "minimum": float(returns.min()),
         "tenth_percentile": float(np.percentile(returns, 10)),
         "median": float(np.median(returns)),
         "below_800": float((returns < FAILED).mean()),
+        "failed": int((returns < FAILED).sum()),
     }
 
 

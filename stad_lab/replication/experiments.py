@@ -1,8 +1,7 @@
-"""The experiments of the replication: a variant, a configuration and some seeds each.
+"""The experiments of the replication: a configuration (with its variant) and some seeds each.
 
-`stad_lab.replication.run` carries them out; `stad_lab.replication.claims` says what came of them.
-All of them were run with pycma 4.5, which adapts sigma by two points (TPA) from 300 searched
-dimensions on and by cumulative path length (CSA) below. The configurations say which.
+Those that we report used pycma 4.5, which adapts sigma by two points (TPA) from 300 searched
+dimensions on, and by cumulative path length (CSA) below; the configurations state which.
 """
 
 import dataclasses
@@ -11,28 +10,53 @@ from dataclasses import dataclass
 
 from stad_lab.config import VARIANTS, Config
 
-BASELINE_DRIVERS = {  # drivers that do not see the road, and have no seeds
+BASELINE_DRIVERS = {  # they do not see the road, and have no seeds
     "random_driver": "smooth random steering and gas, as in the dataset",
     "constant_driver": "straight on with little gas, as the first controller of CMA-ES",
 }
-RECIPES = {  # experiments RECIPE_VARIANT, for all four variants
+RECIPES = {  # each is run with all four variants, as the experiments RECIPE_VARIANT
     "paper": "the paper's recipe, one episode per agent",
     "two_iterations": "two iterations of the world model",
     "fine_tuned": "two iterations and fine-tuning",
     "first_iteration": "the first of the two iterations",
     "no_bar": "one iteration, without the indicator bar",
 }
-FINE_TUNING = {
-    "evolution": {
-        "generations": 15,
-        "population": 32,
-        "tracks": 8,
-        "replay_share": 0.5,
-        "sigma": 0.02,
-        "sigma_decay": 0.97,
-        "validate_every": 5,
-        "averaged_share": 0.5,
-    }
+
+
+def evolution(**changes) -> dict:
+    """Changes of the settings of CMA-ES, for `Config.replace`."""
+    return {"evolution": changes}
+
+
+FINE_TUNING = evolution(
+    generations=15, population=32, tracks=8, replay_share=0.5,
+    sigma=0.02, sigma_decay=0.97, validate_every=5, averaged_share=0.5,
+)  # fmt: skip
+SECOND_ITERATION = evolution(generations=40, sigma=0.05, replay_share=0.5)
+SECOND_ITERATION |= {"data": {"agent_episodes": 110}}
+EARLY_RECIPE = {"data": {"crop_bar": True}} | evolution(
+    population=16, tracks=4, replay_share=0.0,
+    components=0, sigma_decay=0.0, step_size_rule="TPA",
+)  # fmt: skip
+# Single changes of "one_iteration": the experiment whose dataset, V and M are shared (None: own
+# ones) -> experiment -> (what it is, the change). The variant is `input`.
+CHANGES = {
+    None: {
+        "another_seed": ("everything from another seed", {"seed": 1}),
+        **{f"stride_{k}": (f"stride {k}", {"vae": {"stride": k}}) for k in (1, 2, 8)},
+        **{f"latent_{n}": (f"{n} latents", {"vae": {"latent_size": n}}) for n in (16, 64)},
+    },
+    "one_iteration": {
+        "z_only": ("C sees z alone", evolution(features="z")),
+        "h_only": ("C sees h alone", evolution(features="h")),
+        "untrained_mdn_rnn": ("M is not trained", {"mdn_rnn": {"steps": 0}}),
+        "small_population": ("16 agents on 4 tracks each", evolution(population=16, tracks=4)),
+    },
+    "another_seed": {
+        "last_mean": ("the last CMA mean, not an average", evolution(averaged_share=0.0)),
+        "all_weights": ("all weights searched", evolution(components=0, step_size_rule="TPA")),
+        "adaptive_sigma": ("step size adapted by CMA-ES", evolution(sigma_decay=0.0)),
+    },
 }
 
 
@@ -41,147 +65,66 @@ class Experiment:
     """What is run for one line of the results."""
 
     about: str
-    """What is special about it."""
-    config: Config
-    """Of the only iteration, of the second one, or of the fine-tuning."""
-    first: Config | None = None
-    """Of the first iteration of the world model, where there are two."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the CMA-ES runs. V and M, and a first iteration, are trained once for all of them."""
-    world_model: str | None = None
-    """The experiment whose dataset, V and M it shares; None for its own."""
-    base: str | None = None
-    """The experiment whose runs it fine-tunes, seed by seed."""
-    retrained: bool = False
-    """Whether each seed is a whole run, with its own dataset, V and M."""
-
-    @property
-    def variant(self) -> str:
-        """What V sees and reconstructs."""
-        return self.config.variant
+    config: Config  # of the only iteration of V and M, of the second, or of the fine-tuning
+    first: Config | None = None  # of the first iteration, where there are two
+    seeds: tuple[int, ...] = (0, 1, 2)  # of CMA-ES; V and M are trained once for all of them
+    world_model: str | None = None  # experiment whose dataset, V and M it shares; None: its own
+    base: str | None = None  # experiment whose runs it fine-tunes, seed by seed
+    retrained: bool = False  # each seed is a whole run, with its own dataset, V and M
 
     def config_of(self, seed: int) -> Config:
         """The configuration of one seed."""
         own = seed if self.retrained else self.config.seed
-        return self.config.replace(seed=own, evolution={"seed": seed})
+        return self.config.replace(seed=own, **evolution(seed=seed))
 
 
-def recipe_experiments() -> dict[str, Experiment]:
-    """The recipes that are run with all four variants, and the longer run of one of them."""
+def make_experiments() -> dict[str, Experiment]:
+    """All experiments by name."""
     found = {}
-    second = {
-        "data": {"agent_episodes": 110},
-        "evolution": {"generations": 40, "sigma": 0.05, "replay_share": 0.5},
-    }
-    for variant in VARIANTS:
-        own = {"variant": variant}
-        paper = Config.preset("paper", **own, evolution={"step_size_rule": "TPA"})
-        one = Config.preset("laptop", **own, data={"crop_bar": False})
-        first = one.replace(evolution={"generations": 15})
-        two = first.replace(**second)
-        recipes = {
+    for name in VARIANTS:
+        paper = Config.preset("paper", variant=name, **evolution(step_size_rule="TPA"))
+        no_bar = Config.preset("laptop", variant=name)
+        first = no_bar.replace(data={"crop_bar": False}, **evolution(generations=15))
+        two = first.replace(**SECOND_ITERATION)
+        tuned, base = two.replace(**FINE_TUNING), f"two_iterations_{name}"
+        for recipe, fields in {
             "paper": {"config": paper},
             "two_iterations": {"config": two, "first": first},
-            "fine_tuned": {
-                "config": two.replace(**FINE_TUNING),
-                "base": f"two_iterations_{variant}",
-            },
+            "fine_tuned": {"config": tuned, "base": base},
             "first_iteration": {"config": first, "seeds": (0, 1, 2, 3, 4), "retrained": True},
-            "no_bar": {
-                "config": Config.preset("laptop", **own),
-                "seeds": (0, 1),
-                "retrained": True,
-            },
-        }
-        for name, fields in recipes.items():
-            found[f"{name}_{variant}"] = Experiment(RECIPES[name], **fields)
+            "no_bar": {"config": no_bar, "seeds": (0, 1), "retrained": True},
+        }.items():
+            found[f"{recipe}_{name}"] = Experiment(RECIPES[recipe], **fields)
+    return found | make_changes(found["two_iterations_input"])
+
+
+def make_changes(base: Experiment) -> dict[str, Experiment]:
+    """The experiments that change parts of a recipe, all with the variant of `base`."""
+    two, first, shared = base.config, base.first, f"two_iterations_{base.config.variant}"
+    found = {
+        "one_iteration": Experiment("one iteration", first.replace(**evolution(generations=55)))
+    }
+    for world_model, changed in CHANGES.items():
+        for name, (about, changes) in changed.items():
+            config = found[world_model or "one_iteration"].config.replace(**changes)
+            found[name] = Experiment(about, config, None, (0,), world_model)
+    long, new = evolution(generations=160, sigma_decay=0.99), evolution(replay_share=0.0)
+    early, about = [one.replace(**EARLY_RECIPE) for one in (two, first)], "two iterations, "
+    longer = Experiment(about + "four times as long", two.replace(**long), first, (0,), shared)
+    only_new = Experiment(about + "new tracks only", two.replace(**new), first, (0,))
+    before = Experiment(about + "before the recipe was improved", *early, (0,))
+    found |= {"long_two_iterations": longer, "no_replay": only_new, "early_recipe": before}
     return found
 
 
-def changed_experiments(recipes: dict[str, Experiment]) -> dict[str, Experiment]:
-    """Experiments that change one thing, all with the variant `input`."""
-    two = recipes["two_iterations_input"]
-    one = Experiment("one iteration", two.first.replace(evolution={"generations": 55}))
-    found = {"one_iteration": one}
-    for name, (about, changes, shared) in CHANGES.items():
-        config = found[shared or "one_iteration"].config.replace(**changes)
-        found[name] = Experiment(about, config, seeds=(0,), world_model=shared)
-    for name, (about, changes, both) in TWO_ITERATIONS_CHANGES.items():
-        first = two.first.replace(**changes) if both else two.first
-        shared = "two_iterations_input" if name == "long_two_iterations" else None
-        found[name] = Experiment(about, two.config.replace(**changes), first, (0,), shared)
-    return found
-
-
-# Name -> what it is, the change, and the experiment whose V and M it shares (None: its own).
-CHANGES = {
-    "z_only": ("C sees z alone", {"evolution": {"features": "z"}}, "one_iteration"),
-    "h_only": ("C sees h alone", {"evolution": {"features": "h"}}, "one_iteration"),
-    "untrained_mdn_rnn": ("M is not trained", {"mdn_rnn": {"steps": 0}}, "one_iteration"),
-    "small_population": (
-        "16 agents on 4 tracks each",
-        {"evolution": {"population": 16, "tracks": 4}},
-        "one_iteration",
-    ),
-    "another_seed": ("everything from another seed", {"seed": 1}, None),
-    "last_mean": (
-        "the last CMA mean, not an average",
-        {"evolution": {"averaged_share": 0.0}},
-        "another_seed",
-    ),
-    "all_weights": (
-        "every weight of C searched",
-        {"evolution": {"components": 0, "step_size_rule": "TPA"}},
-        "another_seed",
-    ),
-    "adaptive_sigma": (
-        "step size adapted by CMA-ES",
-        {"evolution": {"sigma_decay": 0.0}},
-        "another_seed",
-    ),
-    **{f"stride_{k}": (f"stride {k}", {"vae": {"stride": k}}, None) for k in (1, 2, 8)},
-    **{f"latent_{n}": (f"{n} latents", {"vae": {"latent_size": n}}, None) for n in (16, 64)},
-}
-# The same for two iterations; the last entry says whether the first iteration changes as well.
-TWO_ITERATIONS_CHANGES = {
-    "long_two_iterations": (
-        "two iterations, four times as long",
-        {"evolution": {"generations": 160, "sigma_decay": 0.99}},
-        False,
-    ),
-    "no_replay": ("two iterations, new tracks only", {"evolution": {"replay_share": 0.0}}, False),
-    "early_recipe": (
-        "two iterations, before the recipe was improved",
-        {
-            "data": {"crop_bar": True},
-            "evolution": {
-                "population": 16,
-                "tracks": 4,
-                "replay_share": 0.0,
-                "components": 0,
-                "sigma_decay": 0.0,
-                "step_size_rule": "TPA",
-            },
-        },
-        True,
-    ),
-}
-RECIPE_EXPERIMENTS = recipe_experiments()
-EXPERIMENTS = RECIPE_EXPERIMENTS | changed_experiments(RECIPE_EXPERIMENTS)
+EXPERIMENTS = make_experiments()
 
 
 def find_experiment(name: str, seeds: Sequence[int] | None = None) -> Experiment:
-    """The experiment of a name, reduced to `seeds` if they are given.
-
-    Raises:
-        ValueError: no such experiment, or it has no such seed.
-    """
+    """The experiment of a name, with `seeds` alone if given; ValueError if there is none such."""
     if name not in EXPERIMENTS:
-        known = ", ".join([*EXPERIMENTS, *BASELINE_DRIVERS])
-        raise ValueError(f"unknown experiment {name!r}: choose one of {known}")
+        raise ValueError(f"unknown experiment {name!r}: choose one of {', '.join(EXPERIMENTS)}")
     found = EXPERIMENTS[name]
-    if unknown := [seed for seed in seeds or () if seed not in found.seeds]:
-        raise ValueError(
-            f"experiment {name!r} has no seed {unknown[0]}: choose from {list(found.seeds)}"
-        )
+    if unknown := set(seeds or ()) - set(found.seeds):
+        raise ValueError(f"experiment {name!r} has no seed {min(unknown)}: it has {found.seeds}")
     return dataclasses.replace(found, seeds=tuple(dict.fromkeys(seeds))) if seeds else found

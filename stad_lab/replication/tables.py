@@ -13,35 +13,23 @@ from pathlib import Path
 import numpy as np
 import pandas
 
-from stad_lab.config import VARIANTS, Config
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
 
 DATA = Path(__file__).parent / "data"
 TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
-KEYS = {  # table -> the columns that name a line, all others are values
-    "episodes": ("experiment", "seed", "track"),
-    "fast_episodes": ("agent", "processor", "track"),
-    "generations": ("experiment", "role", "seed", "generation"),
-    "runs": ("experiment", "role", "seed"),
-    "histories": ("experiment", "role", "seed", "network", "step", "data"),
-    "probe": ("world_model", "seed", "driver", "features", "quantity"),
-    "model_metrics": ("model", "world_model", "metric", "index"),
-    "speed": ("part", "measure", "condition", "round"),
-    "provenance": ("table", "source"),
-}
-VALUES = {  # table -> the columns that it must have besides, and that are never empty
-    "episodes": ("return", "frames"),
-    "fast_episodes": ("return", "frames"),
-    "generations": ("worst", "mean", "best", "sigma", "frames"),
-    "runs": ("variant", "commit"),
-    "histories": ("total",),
-    "probe": ("variant", "trained", "indicator_bar", "r2", "low", "high"),
-    "model_metrics": ("value",),
-    "speed": ("value",),
-    "provenance": ("commit",),
-}
-FLOATS = ("return", "worst", "mean", "best", "value")  # although all may be whole numbers
 UNITS = ("agents", "episodes", "frames")
+RUN = ["experiment", "role", "seed"]
+TABLES = {  # name -> columns that name a line, and others that each line must have
+    "episodes": (["experiment", "seed", "track"], ["return", "frames"]),
+    "fast_episodes": (["agent", "processor", "track"], ["return", "frames"]),
+    "generations": ([*RUN, "generation"], ["worst", "mean", "best", "sigma", "frames"]),
+    "runs": (RUN, ["variant", "commit"]),
+    "histories": ([*RUN, "network", "step", "data"], ["total"]),
+    "probe": (["world_model", "seed", "driver", "features", "quantity"], ["variant", "r2"]),
+    "model_metrics": (["model", "world_model", "metric", "index"], ["value"]),
+    "speed": (["part", "measure", "condition", "round"], ["value"]),
+    "provenance": (["table", "source"], ["commit"]),
+}
 
 
 def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
@@ -50,16 +38,13 @@ def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
     Raises:
         ValueError: a column is missing or has gaps, or a line is there twice.
     """
-    path = folder / f"{name}.csv"
+    (keys, values), path = TABLES[name], folder / f"{name}.csv"
     table = pandas.read_csv(path, float_precision="round_trip", low_memory=False)
-    needed = [*KEYS[name], *VALUES[name]]
-    if missing := [column for column in needed if column not in table]:
-        raise ValueError(f"{path} has no column {', '.join(missing)}")
-    if gaps := [column for column in needed if table[column].isna().any()]:
-        raise ValueError(f"{path} has empty cells in {', '.join(gaps)}")
-    if (twice := table.duplicated(list(KEYS[name]))).any():
-        line = ", ".join(map(str, table.loc[twice, list(KEYS[name])].iloc[0]))
-        raise ValueError(f"{path} has two lines for {line}")
+    for column in keys + values:
+        if column not in table or table[column].isna().any():
+            raise ValueError(f"{path}: column {column!r} is missing or has empty cells")
+    if (twice := table.duplicated(keys)).any():
+        raise ValueError(f"{path}: more than one line for {table.loc[twice, keys].values[0]}")
     return table
 
 
@@ -71,9 +56,14 @@ def episodes(folder: Path = DATA) -> pandas.DataFrame:
     """
     table = read("episodes", folder)
     for (experiment, seed), run in table.groupby(["experiment", "seed"]):
-        if sorted(run["track"]) != list(range(TRACKS)):
-            raise ValueError(f"{experiment}, seed {seed}: expected the tracks 0 to {TRACKS - 1}")
+        check_tracks(f"{experiment}, seed {seed}", run["track"])
     return table
+
+
+def check_tracks(name: str, tracks) -> None:
+    """Raise ValueError unless an evaluation drives every official track once."""
+    if sorted(tracks) != list(range(TRACKS)):
+        raise ValueError(f"{name}: expected one episode on each of the tracks 0 to {TRACKS - 1}")
 
 
 def returns_of(table: pandas.DataFrame, column: str = "return") -> dict[str, np.ndarray]:
@@ -83,7 +73,7 @@ def returns_of(table: pandas.DataFrame, column: str = "return") -> dict[str, np.
 
 
 def fitness(run: str, folder: Path = DATA) -> dict[str, np.ndarray]:
-    """All returns of a CMA-ES run, named as by `key`.
+    """All returns of a CMA-ES run, which is named as by `key`.
 
     Returns:
         "returns" float64 (generations, agents, tracks), "tracks" int (generations, tracks) and
@@ -94,70 +84,67 @@ def fitness(run: str, folder: Path = DATA) -> dict[str, np.ndarray]:
 
 
 def key(experiment: str, seed: int, role: str = "run") -> str:
-    """The name of a run in file names: "paper_frame-0", "two_iterations_frame-0-first_iteration"."""
+    """The name of a run in file names, for example "paper_frame-0"."""
     return f"{experiment}-{seed}" + f"-{role}" * (role != "run")
 
 
-def add_run(
-    folder: Path, experiment: str, seed: int, to: Path = DATA, role: str = "run"
-) -> None:
+def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str = "run") -> None:
     """Add the records of a finished run to the tables, in place of those that it has there.
 
     Raises:
         ValueError: the evaluation is of another variant, renderer, controller or other tracks.
     """
-    run = {"experiment": experiment, "role": role, "seed": seed}
-    record = load(folder / "record.json")
-    line = run | describe_record(record)
-    if (log_file := folder / "evolution.json").exists():
-        log = load(log_file)
-        line |= {"vae": log["vae"], "mdn_rnn": log["mdn_rnn"]} | flatten(log["best"], "best")
-        add_log(run, log, to)
-    for network in ("vae", "mdn_rnn"):
-        if (weights := folder / f"{network}.safetensors").exists() and role != "run":
-            metadata = read_metadata(weights)
-            line[network] = metadata["weights"]
-            add_history(run | {"network": network}, metadata["history"], to)
-    if (controller := folder / "controller.safetensors").exists():
-        line["controller"] = hashlib.sha256(controller.read_bytes()).hexdigest()
-        copy = to / "controllers" / f"{key(experiment, seed, role)}.safetensors"
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(controller, copy)
-    if (evaluation_file := folder / "evaluation.json").exists():
-        evaluation = load(evaluation_file)
-        check_evaluation(evaluation_file, evaluation, experiment, line.get("controller"))
+    run = dict(zip(RUN, (experiment, role, seed), strict=True))
+    line = run | describe_record(load(folder / "record.json"))
+    if (file := folder / "controller.safetensors").exists():
+        line["controller"] = hashlib.sha256(file.read_bytes()).hexdigest()
+    if (path := folder / "evaluation.json").exists():  # checked before anything is written
+        evaluation = load(path)
+        check_evaluation(path, evaluation, experiment, line.get("controller"))
         line["seconds.evaluation"] = evaluation["seconds"]
         driven = pandas.DataFrame(evaluation["episodes"])
         replace_lines("episodes", driven.assign(experiment=experiment, seed=seed), to)
+    if (path := folder / "evolution.json").exists():
+        log = load(path)
+        line |= {"vae": log["vae"], "mdn_rnn": log["mdn_rnn"]} | flatten(log["best"], "best.")
+        add_log(run, log["generations"], to)
+    for network in ("vae", "mdn_rnn"):
+        if (path := folder / f"{network}.safetensors").exists() and role != "run":
+            content = path.read_bytes()  # its header: a length of 8 bytes, then JSON
+            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
+            metadata = json.loads(header["__metadata__"]["stad_lab"])
+            line[network] = metadata["weights"]
+            add_history(run | {"network": network}, metadata["history"], to)
+    if file.exists():
+        (to / "controllers").mkdir(exist_ok=True)
+        copy = to / "controllers" / f"{key(experiment, seed, role)}.safetensors"
+        shutil.copyfile(file, copy)
     replace_lines("runs", pandas.DataFrame([line]), to)
 
 
 def check_evaluation(path: Path, found: dict, experiment: str, controller: str | None) -> None:
     """Raise ValueError unless an evaluation is the official one of this experiment's agent."""
-    driver = experiment in BASELINE_DRIVERS
-    variant = experiment if driver else EXPERIMENTS[experiment].variant
-    tracks = [episode["track"] for episode in found["episodes"]]
-    for name, value, wanted in (
-        ("variant", found["variant"], variant),
-        ("renderer", found["renderer"], found["renderer"] if driver else "gymnasium"),
-        ("controller", found.get("controller"), controller),
-        ("tracks", sorted(tracks), list(range(TRACKS))),
-    ):
-        if value != wanted:
-            raise ValueError(f"{path}: {name} is {value}, expected {wanted}")
+    wanted = {"variant": experiment}  # a driver without V sees no picture, of whatever renderer
+    if experiment not in BASELINE_DRIVERS:
+        variant = EXPERIMENTS[experiment].config.variant
+        wanted = {"variant": variant, "renderer": "gymnasium", "controller": controller}
+    for name, value in wanted.items():
+        if found[name] != value:
+            raise ValueError(f"{path}: {name} is {found[name]!r}, expected {value!r}")
+    check_tracks(str(path), [episode["track"] for episode in found["episodes"]])
 
 
 def describe_record(record: dict) -> dict:
     """The line of `runs` for a record: settings, machine, times and budget, with dotted names."""
-    line = {"variant": record["variant"], **flatten(record.get("config", {}), "config")}
-    line.pop("config.variant", None)
-    line |= record["made_with"]
+    line = flatten({"config": record.get("config", {})}) | record["made_with"]
+    line |= {"variant": record["variant"], "config.variant": None}
     line["continued_with"] = " ".join(one["commit"] for one in record.get("continued_with", []))
-    line |= flatten(record.get("seconds", {}), "seconds") | flatten(record["budget"], "budget")
+    line |= flatten({name: record.get(name, {}) for name in ("seconds", "budget")})
     for stage, starts in record.get("peak_memory", {}).items():
         for process in starts[0]:
             line[f"megabytes.{stage}.{process}"] = max(start[process] for start in starts)
-    return line | flatten(total_budget(record), "total")
+    line |= flatten(total_budget(record), "total.")
+    return {name: value for name, value in line.items() if value is not None}
 
 
 def total_budget(record: dict) -> dict[str, int]:
@@ -169,91 +156,72 @@ def total_budget(record: dict) -> dict[str, int]:
     total = {unit: sum(part[unit] for part in parts) for unit in ("episodes", "frames")}
     total["agents"] = record["budget"].get("agents", 0)
     if "earlier" in record:
-        same = same_random_episodes(record["config"], record["earlier"]["config"])
+        one, other = (
+            (c["seed"], c["data"]) for c in (record["config"], record["earlier"]["config"])
+        )
+        names = ("episodes", "episode_frames", "random_starts", "crop_bar")
+        same = one[0] == other[0] and all(one[1][name] == other[1][name] for name in names)
         again = record["budget"]["random"] if same else {}
         before = total_budget(record["earlier"])
         total = {unit: total[unit] + before[unit] - again.get(unit, 0) for unit in UNITS}
     return total
 
 
-def same_random_episodes(one: dict, other: dict) -> bool:
-    """Whether two configurations collect the same episodes with the random driver."""
-    names = ("episodes", "episode_frames", "random_starts", "crop_bar")
-    return one["seed"] == other["seed"] and all(one["data"][n] == other["data"][n] for n in names)
-
-
-def add_log(run: dict, log: dict, to: Path) -> None:
+def add_log(run: dict, generations: list[dict], to: Path) -> None:
     """Add the log of a CMA-ES run to `generations` and to the compact file of all returns."""
-    lines, entries = [], log["generations"]
-    for entry in entries:
-        means = np.mean(entry["returns"], axis=1)
-        validation = entry.get("validation", {})
-        lines.append(
-            run
-            | {name: entry[name] for name in ("generation", "frames", "sigma", "mean_checksum")}
-            | {"worst": means.min(), "mean": means.mean(), "best": means.max()}
-            | {"validation": validation.get("mean")}
-            | {f"validation_{name}": validation.get(name) for name in ("frames", "controller_checksum")}
-        )
-    replace_lines("generations", pandas.DataFrame(lines), to)
-    path, name = to / "fitness.npz", key(**run)
-    kept = dict(np.load(path)) if path.exists() else {}
-    validated = [entry["validation"]["returns"] for entry in entries if "validation" in entry]
-    kept |= {
-        f"{name}/returns": np.array([entry["returns"] for entry in entries]),
-        f"{name}/tracks": np.array([entry["tracks"] for entry in entries]),
-        f"{name}/validation": np.array(validated),
+    lines = pandas.DataFrame([run | flatten(entry) for entry in generations])
+    means = [np.mean(entry["returns"], axis=1) for entry in generations]
+    for name, statistic in (("worst", np.min), ("mean", np.mean), ("best", np.max)):
+        lines[name] = [statistic(fitness) for fitness in means]
+    validated = [entry["validation"]["returns"] for entry in generations if "validation" in entry]
+    returns = {
+        "returns": [entry["returns"] for entry in generations],
+        "tracks": [entry["tracks"] for entry in generations],
+        "validation": validated,
     }
+    replace_lines(
+        "generations", lines.drop(columns=["validation.returns", "returns", "tracks"]), to
+    )
+    path = to / "fitness.npz"
+    kept = dict(np.load(path)) if path.exists() else {}
+    kept |= {f"{key(**run)}/{part}": np.array(values) for part, values in returns.items()}
     np.savez_compressed(path, **{name: kept[name] for name in sorted(kept)})
-
-
-def read_metadata(path: Path) -> dict:
-    """What a file of weights says about itself."""
-    content = path.read_bytes()
-    header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-    return json.loads(header["__metadata__"]["stad_lab"])
 
 
 def add_history(network: dict, history: list[dict], to: Path) -> None:
     """Add the losses of a network's training to `histories`."""
-    lines = [
-        network | {"step": entry["step"], "data": data} | entry[data]
-        for entry in history
-        for data in ("train", "heldout")
-    ]
+    both = [(entry, data) for entry in history for data in ("train", "heldout")]
+    lines = [network | {"step": one["step"], "data": data} | one[data] for one, data in both]
     replace_lines("histories", pandas.DataFrame(lines), to)
 
 
 def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
-    """Write a table with new lines in the place of those of the same run."""
-    path = folder / f"{name}.csv"
-    run = [column for column in ("experiment", "role", "seed", "network") if column in lines]
-    table = lines
-    if path.exists():
+    """Write a table with new lines in the place of those of the same run (and network)."""
+    run = [column for column in (*RUN, "network") if column in lines]
+    if (folder / f"{name}.csv").exists():
         old = read(name, folder)
-        runs = set(lines[run].itertuples(index=False, name=None))
-        kept = [row not in runs for row in old[run].itertuples(index=False, name=None)]
-        table = pandas.concat([old[kept], lines])
-    save(name, table, folder)
+        new = pandas.MultiIndex.from_frame(lines[run])
+        lines = pandas.concat([old[~pandas.MultiIndex.from_frame(old[run]).isin(new)], lines])
+    save(name, lines, folder)
 
 
 def save(name: str, table: pandas.DataFrame, folder: Path = DATA) -> None:
-    """Write a table in the order of its keys; floats with all digits, whole numbers without."""
-    keys = list(KEYS[name])
-    table = table[keys + [column for column in table if column not in keys]]
-    for column in table.select_dtypes("float"):
-        if (table[column].dropna() % 1 == 0).all() and column not in FLOATS:
+    """Write a table in the order of its keys: floats with all digits, whole numbers without."""
+    keys = TABLES[name][0]
+    table = table[keys + [column for column in table if column not in keys]].sort_values(keys)
+    for column in table.select_dtypes("float"):  # gaps make floats of whole numbers
+        if (table[column].dropna() % 1 == 0).all():
             table[column] = table[column].astype("Int64")
     folder.mkdir(parents=True, exist_ok=True)
-    table.sort_values(keys).to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+    table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
 
 
-def flatten(values: dict, prefix: str) -> dict:
-    """{"a": {"b": 1}} -> {"prefix.a.b": 1}."""
+def flatten(values: dict, prefix: str = "") -> dict:
+    """{"a": {"b": 1}} -> {"a.b": 1}."""
     found = {}
     for name, value in values.items():
-        dotted = f"{prefix}.{name}"
-        found |= flatten(value, dotted) if isinstance(value, dict) else {dotted: value}
+        nested = isinstance(value, dict)
+        found |= flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
     return found
 
 
