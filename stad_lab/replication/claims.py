@@ -12,6 +12,7 @@ import pandas
 
 from stad_lab.config import VARIANTS
 from stad_lab.evaluation import statistics
+from stad_lab.io.files import load_json, write_bytes
 from stad_lab.replication import measurements, tables
 from stad_lab.replication.experiments import BASELINE_DRIVERS, CHANGES, EXPERIMENTS, RECIPES
 
@@ -76,7 +77,7 @@ def describe_experiment(name: str, episodes: pandas.DataFrame, runs: pandas.Data
         "best_90": float(np.sort(returns, axis=1)[:, -BEST:].mean()),
         "runs": returns.mean(axis=1).tolist(),
         **{unit: float(run[f"total.{unit}"].mean()) for unit in tables.UNITS},
-        "lost": statistics.lost_points(own["return"].to_numpy(), own["frames"].to_numpy()),
+        "lost": measurements.lost_points(own["return"].to_numpy(), own["frames"].to_numpy()),
     }
 
 
@@ -138,7 +139,9 @@ def describe_agents(folder: Path = PRETRAINED) -> dict:
     """The shipped agents on the tracks 0 to 99, with Gymnasium's renderer."""
     found = {}
     for path in sorted(folder.glob("*/evaluation.json")):
-        record, evaluation = tables.load(path.with_name("record.json")), tables.load(path)
+        record, evaluation = (
+            load_json(path.with_name(name)) for name in ("record.json", path.name)
+        )
         returns = np.array([episode["return"] for episode in evaluation["episodes"]])
         found[path.parent.name] = {
             **statistics.summarise(returns),
@@ -241,7 +244,7 @@ def write_claims(path: Path = CLAIMS) -> None:
     for section, entries in compute_claims().items():
         lines = [f"  {json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
         sections.append(f" {json.dumps(section)}: {{\n" + ",\n".join(lines) + "\n }")
-    path.write_text("{\n" + ",\n".join(sections) + "\n}\n", encoding="utf-8")
+    write_bytes(path, ("{\n" + ",\n".join(sections) + "\n}\n").encode())
 
 
 def read_claims(path: Path = CLAIMS) -> dict:
