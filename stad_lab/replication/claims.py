@@ -15,6 +15,7 @@ from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
 from stad_lab.replication import measurements, tables
 from stad_lab.replication.experiments import BASELINE_DRIVERS, CHANGES, EXPERIMENTS, RECIPES
+from stad_lab.training.pipeline import total_budget
 
 CLAIMS = tables.DATA / "claims.json"
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
@@ -149,7 +150,7 @@ def describe_agents(folder: Path = PRETRAINED) -> dict:
             "without_worst_5": float(np.sort(returns)[5:].mean()),
             "without_best_5": float(np.sort(returns)[:-5].mean()),
             "gymnasium": record["made_with"]["gymnasium"],
-            **tables.total_budget(record),
+            **total_budget(record),
         }
     return found
 
@@ -238,13 +239,14 @@ def forest(claims: dict) -> list[dict]:
     ]
 
 
-def write_claims(path: Path = CLAIMS) -> None:
-    """Compute all statistics and write them, a line for each name in each section."""
+def write_claims(path: Path = CLAIMS) -> Path:
+    """Compute all statistics and write them, a line for each name; returns the file."""
     sections = []
     for section, entries in compute_claims().items():
         lines = [f"  {json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
         sections.append(f" {json.dumps(section)}: {{\n" + ",\n".join(lines) + "\n }")
     write_bytes(path, ("{\n" + ",\n".join(sections) + "\n}\n").encode())
+    return path
 
 
 def read_claims(path: Path = CLAIMS) -> dict:

@@ -11,8 +11,10 @@ from pathlib import Path
 import numpy as np
 import pandas
 
+from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.io.files import checksum_of_tensors, load_json, load_tensors, write_bytes
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
+from stad_lab.training.pipeline import total_budget
 
 DATA = Path(__file__).parent / "data"
 TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
@@ -97,7 +99,7 @@ def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str
     if (file := folder / "controller.safetensors").exists():
         line["controller"] = checksum_of_tensors(load_tensors(file)[0])
     if (path := folder / "evaluation.json").exists():  # checked before anything is written
-        evaluation = load_json(path, "evaluate again")
+        evaluation = load_evaluation(path)
         check_evaluation(path, evaluation, experiment, line.get("controller"))
         line["seconds.evaluation"] = evaluation["seconds"]
         driven = pandas.DataFrame(evaluation["episodes"])
@@ -141,28 +143,6 @@ def describe_record(record: dict) -> dict:
             line[f"megabytes.{stage}.{process}"] = max(start[process] for start in starts)
     line |= flatten(total_budget(record), "total.")
     return {name: value for name, value in line.items() if value is not None}
-
-
-def total_budget(record: dict) -> dict[str, int]:
-    """Agents, episodes and frames of a run and of the runs before it that it continues.
-
-    A second iteration drives the random episodes of the first once more; they count once.
-    """
-    parts = [part for part in record["budget"].values() if isinstance(part, dict)]
-    total = {unit: sum(part[unit] for part in parts) for unit in ("episodes", "frames")}
-    total["agents"] = record["budget"].get("agents", 0)
-    if "earlier" in record:
-        before, same = total_budget(record["earlier"]), same_dataset(record, record["earlier"])
-        again = record["budget"]["random"] if same else {}
-        total = {unit: total[unit] + before[unit] - again.get(unit, 0) for unit in UNITS}
-    return total
-
-
-def same_dataset(one: dict, other: dict) -> bool:
-    """Whether the random driver drives the same episodes for two records."""
-    names = ("seed", "data.episodes", "data.episode_frames", "data.random_starts", "data.crop_bar")
-    one, other = (flatten(record["config"]) for record in (one, other))
-    return all(one[name] == other[name] for name in names)
 
 
 def add_log(run: dict, log: list[dict], to: Path) -> None:

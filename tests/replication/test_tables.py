@@ -32,15 +32,20 @@ def test_a_run_is_added_once_and_read_exactly(run, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"renderer": "fast"}, "renderer is 'fast', expected 'gymnasium'"),
-        ({"variant": "input"}, "variant is 'input', expected 'frame'"),
-        ({"controller": "0"}, "controller is '0'"),
-        ({"episodes": [{"track": 0, "return": 950.0, "frames": 500}] * 100}, "tracks 0 to 99"),
-        ({"episodes": []}, "tracks 0 to 99"),
+        (lambda _: {"renderer": "fast"}, "renderer is 'fast', expected 'gymnasium'"),
+        (lambda _: {"variant": "input"}, "variant is 'input', expected 'frame'"),
+        (lambda _: {"controller": "0"}, "controller is '0'"),
+        (lambda _: {"mean": 950.0}, "mean=950"),
+        (lambda episodes: {"episodes": episodes[:1] * 100}, "100 episodes on 1 tracks"),
+        (
+            lambda episodes: {"episodes": [one | {"track": one["track"] + 1} for one in episodes]},
+            "tracks 0 to 99",
+        ),
     ],
 )
 def test_an_evaluation_that_is_not_the_official_one_is_refused(run, tmp_path, change, message):
-    save_json(run / "evaluation.json", load_json(run / "evaluation.json") | change)
+    evaluation = load_json(run / "evaluation.json")
+    save_json(run / "evaluation.json", evaluation | change(evaluation["episodes"]))
     with pytest.raises(ValueError, match=message):
         tables.add_run(run, "fine_tuned_frame", 0, tmp_path)
     assert not list(tmp_path.glob("*.csv"))
