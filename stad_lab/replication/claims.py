@@ -36,7 +36,7 @@ def compute_claims() -> dict[str, dict]:
     episodes, runs, generations = tables.episodes(), tables.read("runs"), tables.read("generations")
     probe, returns = tables.read("probe"), tables.returns_of(episodes)
     made = [name for name in (*BASELINE_DRIVERS, *EXPERIMENTS) if name in returns]
-    trained = set(runs.experiment[runs.role == "world_model"])
+    trained = [name for name in made if name in set(runs.query("role == 'world_model'").experiment)]
     recipes = {name: compare_recipe(returns, name) for name in COMPARED}
     yaw_rate = measurements.yaw_rate_of_z(probe)
     return {
@@ -54,9 +54,7 @@ def compute_claims() -> dict[str, dict]:
         "yaw_rate_of_z": yaw_rate,
         "probe": measurements.describe_probe(probe),
         "models": measurements.describe_models(tables.read("model_metrics")),
-        "stage_minutes": {
-            name: measurements.stage_minutes(runs, name) for name in made if name in trained
-        },
+        "stage_minutes": {name: measurements.stage_minutes(runs, name) for name in trained},
         "speed": measurements.describe_speed(tables.read("speed")),
     }
 
@@ -176,11 +174,9 @@ def compare_fine_tuning(returns: dict[str, np.ndarray], variant: str) -> dict:
     """What fine-tuning gained, run by run on the same tracks."""
     before, after = (returns[f"{recipe}_{variant}"] for recipe in ("two_iterations", "fine_tuned"))
     failed = [(scores < statistics.FAILED).sum(axis=1).tolist() for scores in (before, after)]
-    gain = {
-        "gain": float((after - before).mean()),
-        "interval": statistics.bootstrap(after - before),
-    }
-    return gain | dict(zip(("failed_before", "failed_after"), failed, strict=True))
+    interval = statistics.bootstrap(after - before)
+    found = {"gain": float((after - before).mean()), "interval": interval}
+    return found | dict(zip(("failed_before", "failed_after"), failed, strict=True))
 
 
 def describe_paper_runs(
@@ -209,14 +205,13 @@ def learning_curve(
     """
     named = f"experiment == {experiment!r} and role == 'run' and seed == {seed}"
     run, log = runs.query(named).iloc[0], generations.query(named)
-    validated, size = log["validation.mean"].notna(), "config.evolution."
-    parts = (run[f"budget.{part}.episodes"] for part in ("evolution", "validation"))
-    driven = (
-        run["total.episodes"]
-        - sum(parts)
-        + log["generation"] * (run[size + "population"] * run[size + "tracks"])
-        + validated.cumsum() * run[size + "validation_tracks"]
+    population, tracks, validations = (
+        run[f"config.evolution.{name}"] for name in ("population", "tracks", "validation_tracks")
     )
+    own = run["budget.evolution.episodes"] + run["budget.validation.episodes"]
+    validated = log["validation.mean"].notna()
+    driven = run["total.episodes"] - own + log["generation"] * population * tracks
+    driven += validated.cumsum() * validations
     return driven[validated].to_numpy(np.int64), log["validation.mean"][validated].to_numpy()
 
 
