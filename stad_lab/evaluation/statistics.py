@@ -73,7 +73,7 @@ def welch_p(one: Sequence[float], other: Sequence[float]) -> float:
 def pooled_interval(groups: Sequence[Sequence[float]], before: int, after: int) -> list[float]:
     """95% interval of mean(groups[after]) - mean(groups[before]), by Student's t.
 
-    The variance within groups is pooled over all of them: two runs tell too little of their own.
+    The variance within groups is pooled over all of them: two runs alone estimate it poorly.
     """
     free = sum(len(group) - 1 for group in groups)
     variance = sum(np.var(group) * len(group) for group in groups) / free

@@ -182,7 +182,7 @@ def compare_fine_tuning(returns: dict[str, np.ndarray], variant: str) -> dict:
 def describe_paper_runs(
     returns: dict, runs: pandas.DataFrame, generations: pandas.DataFrame
 ) -> dict:
-    """Each run of the paper's recipe; `vae` tells which V it had."""
+    """Each run of the paper's recipe; `vae` names the V that it had."""
     found = {}
     for run in runs[runs.experiment.str.startswith("paper_") & (runs.role == "run")].itertuples():
         scores = returns[run.experiment][run.seed]
