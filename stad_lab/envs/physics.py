@@ -115,7 +115,9 @@ CAR = np.dtype(
         ("force", "f4", (BODIES, 2)),
         ("rest", "f4", BODIES),  # seconds at rest
         # Joints, one per wheel.
-        ("impulse", "f4", (WHEELS, 4)),  # accumulated: x, y, stop, motor
+        ("push", "f4", (WHEELS, 2)),  # accumulated impulse of the point, x and y
+        ("motor", "f4", WHEELS),  # accumulated impulse of the motor
+        ("stop", "f4", WHEELS),  # accumulated impulse of the stop
         ("at_stop", "i4", WHEELS),  # -1 at the lower stop, 1 at the upper, else 0
         ("motor_speed", "f4", WHEELS),  # radians per second
         # Wheels as Gymnasium's `Car` sees them.
@@ -567,10 +569,11 @@ def skins_overlap(simplex, count):
 
 
 # --- 3. Rigid bodies ------------------------------------------------------------------------------
-# During a step, what the sweeps change lies in one float32 array `state` of 32 numbers: the velocities
-# of the five bodies (x, y, spin), one unused, and the impulses of the four joints (x, y, stop, motor).
+# In the sweeps, `state` is float32 (24,): the velocities of the five bodies (x, y, spin), one number
+# that is not used, and the accumulated impulses of the four motors and of the four stops.
 
-VELOCITIES, IMPULSES = slice(0, 15), slice(16, 32)
+MOTOR, STOPPER = 16, 20  # where these impulses begin in `state`
+STATE_SIZE = 24
 # What a joint needs in the sweeps, in its row of `joints`: r_A, the matrix K in the plane, its third
 # column, the reciprocals of the two determinants, and the product of its second and third column.
 RX, RY, K11, K12, K22, K13, K23, SCALE2, SCALE3, NX, NY, NZ = range(12)
@@ -578,17 +581,18 @@ K33 = HULL_INV_INERTIA + WHEEL_INV_INERTIA
 
 
 @njit(cache=True, nogil=True)
-def solve(car, state, saved, joints):
+def solve(car, state, saved, joints, pushes):
     """One time step: forces, joints, motion, and sleep.
 
     Args:
         car: record, is changed.
-        state, saved: float32 (32,), memory.
+        state, saved: float32 (24,), memory.
         joints: float32 (4, 12), memory.
+        pushes: float32 (180, 4, 2), memory.
     """
     apply_forces(car, state)
     prepare_joints(car, state, joints)
-    solve_velocities(car, state, saved, joints)
+    solve_velocities(car, state, saved, joints, pushes)
     move(car, state)
     solved = False
     for _ in range(POSITION_SWEEPS):
@@ -611,8 +615,8 @@ def apply_forces(car, state):
         state[3 * body + 2] = car.velocity[body, 2] + ZERO  # there is no torque
     state[15] = ZERO
     for i in range(WHEELS):
-        for k in range(4):
-            state[16 + 4 * i + k] = car.impulse[i, k]
+        state[MOTOR + i] = car.motor[i]
+        state[STOPPER + i] = car.stop[i]
 
 
 @njit(cache=True, nogil=True)
@@ -640,65 +644,88 @@ def prepare_joints(car, state, joints):
 
         angle = car.angle[1 + i] - car.angle[HULL]
         at_stop = -1 if angle <= -STOP else (1 if angle >= STOP else 0)
-        impulse = state[16 + 4 * i : 20 + 4 * i]
         if at_stop == 0 or at_stop != car.at_stop[i]:
-            impulse[2] = ZERO
+            state[STOPPER + i] = ZERO
         car.at_stop[i] = at_stop
 
-        wheel = state[3 + 3 * i : 6 + 3 * i]
-        px, py = impulse[0], impulse[1]
+        px, py = car.push[i, 0], car.push[i, 1]
+        motor, stop = state[MOTOR + i], state[STOPPER + i]
+        w = 3 + 3 * i
         state[0] -= ma * px
         state[1] -= ma * py
-        state[2] -= ia * (cross(rx, ry, px, py) + impulse[3] + impulse[2])
-        wheel[0] += mb * px
-        wheel[1] += mb * py
-        wheel[2] += ib * (impulse[3] + impulse[2])
+        state[2] -= ia * (cross(rx, ry, px, py) + motor + stop)
+        state[w] += mb * px
+        state[w + 1] += mb * py
+        state[w + 2] += ib * (motor + stop)
 
 
 @njit(cache=True, nogil=True)
-def solve_velocities(car, state, saved, joints):
+def solve_velocities(car, state, saved, joints, pushes):
     """Sweep over the joints `VELOCITY_SWEEPS` times, or skip what only repeats itself.
 
-    To find a cycle we keep the numbers of one earlier sweep, and replace them after 1, 2, 4, 8, ...
-    sweeps (R. P. Brent's method). If they return after n sweeps, only the remainder of the division
-    of the sweeps left by n must be done.
+    To find a cycle we keep `state` of one earlier sweep, and replace it after 1, 2, 4, 8, ... sweeps
+    (R. P. Brent's method). If it returns after n sweeps, the next n sweeps are the whole cycle:
+    their pushes are added again and again, one by one as the sweeps would do, and the sweeps that are
+    left when less than a cycle remains are done.
     """
     bits, saved_bits = state.view(np.int32), saved.view(np.int32)
-    left = VELOCITY_SWEEPS
     saved_bits[:] = bits
-    age, renew = 0, 1
-    searching = True
+    left, age, renew = VELOCITY_SWEEPS, 0, 1
     while left > 0:
-        sweep(car, state, joints)
+        sweep(car, state, joints, pushes[0])
+        add_push(car, pushes[0])
         left -= 1
-        if not searching:
-            continue
         age += 1
         changed = np.int32(0)
-        for k in range(32):
+        for k in range(STATE_SIZE):
             changed |= bits[k] ^ saved_bits[k]
         if changed == 0:
-            left %= age
-            searching = False
-        elif age == renew:
+            break
+        if age == renew:
             saved_bits[:] = bits
             age, renew = 0, 2 * renew
+    rounds = left // age if age > 0 else 0
+    if rounds > 0:
+        for n in range(age):
+            sweep(car, state, joints, pushes[n])
+        for _ in range(rounds):
+            for n in range(age):
+                add_push(car, pushes[n])
+        left -= rounds * age
+    for _ in range(left):
+        sweep(car, state, joints, pushes[0])
+        add_push(car, pushes[0])
 
 
 @njit(cache=True, nogil=True)
-def sweep(car, state, joints):
-    """Repair the velocity error of each joint once: its motor, then its stop and its point."""
+def add_push(car, push):
+    """Add what one sweep has pushed to the accumulated impulses of the points."""
+    for i in range(WHEELS):
+        car.push[i, 0] += push[i, 0]
+        car.push[i, 1] += push[i, 1]
+
+
+@njit(cache=True, nogil=True)
+def sweep(car, state, joints, push):
+    """Repair the velocity error of each joint once: its motor, then its stop and its point.
+
+    Args:
+        car: record, is read.
+        state: float32 (24,), is changed.
+        joints: constants of the joints.
+        push: float32 (4, 2), is written: the impulses of the points.
+    """
     ma, mb, ia, ib = HULL_INV_MASS, WHEEL_INV_MASS, HULL_INV_INERTIA, WHEEL_INV_INERTIA
     vax, vay, wa = state[0], state[1], state[2]
     for i in range(WHEELS - 1, -1, -1):
-        w, p = 3 + 3 * i, 16 + 4 * i
+        w = 3 + 3 * i
         vbx, vby, wb = state[w], state[w + 1], state[w + 2]
         rx, ry = joints[i, RX], joints[i, RY]
 
-        old = state[p + 3]
+        old = state[MOTOR + i]
         wanted = old + -TURN_MASS * (wb - wa - car.motor_speed[i])
-        state[p + 3] = max(-MOTOR_IMPULSE, min(wanted, MOTOR_IMPULSE))
-        turn = state[p + 3] - old
+        state[MOTOR + i] = max(-MOTOR_IMPULSE, min(wanted, MOTOR_IMPULSE))
+        turn = state[MOTOR + i] - old
         wa -= ia * turn
         wb += ib * turn
 
@@ -707,12 +734,10 @@ def sweep(car, state, joints):
             px, py = solve_point(joints, i, -ex, -ey)
             turn = ZERO
         else:
-            px, py, turn = solve_stop(
-                joints, i, ex, ey, wb - wa, state[p + 2], np.int64(car.at_stop[i])
-            )
-            state[p + 2] += turn
-        state[p] += px
-        state[p + 1] += py
+            so_far, side = state[STOPPER + i], np.int64(car.at_stop[i])
+            px, py, turn = solve_stop(joints, i, ex, ey, wb - wa, so_far, side)
+            state[STOPPER + i] += turn
+        push[i, 0], push[i, 1] = px, py
         vax -= ma * px
         vay -= ma * py
         wa -= ia * (cross(rx, ry, px, py) + turn)
@@ -779,8 +804,8 @@ def move(car, state):
         car.angle[body] += STEP * spin
         car.velocity[body, 0], car.velocity[body, 1], car.velocity[body, 2] = vx, vy, spin
     for i in range(WHEELS):
-        for k in range(4):
-            car.impulse[i, k] = state[16 + 4 * i + k]
+        car.motor[i] = state[MOTOR + i]
+        car.stop[i] = state[STOPPER + i]
 
 
 @njit(cache=True, nogil=True)
@@ -869,10 +894,10 @@ def fall_asleep(car, solved):
 @njit(cache=True, nogil=True)
 def advance(car, road, memory):
     """One frame of the world with the controls as they are set."""
-    state, saved, joints, simplex, corners = memory
+    state, saved, joints, pushes, simplex, corners = memory
     drive_wheels(car)
     touch_tiles(car, road, simplex, corners)
-    solve(car, state, saved, joints)
+    solve(car, state, saved, joints, pushes)
     car.time += FRAME
 
 
@@ -894,9 +919,10 @@ def score(car, road):
 def make_memory():
     """What one thread needs besides the records: arrays that hold nothing between frames."""
     return (
-        np.empty(32, np.float32),
-        np.empty(32, np.float32),
+        np.empty(STATE_SIZE, np.float32),
+        np.empty(STATE_SIZE, np.float32),
         np.empty((WHEELS, 12), np.float32),
+        np.empty((VELOCITY_SWEEPS, WHEELS, 2), np.float32),
         np.empty((3, 7), np.float32),
         np.empty((6, 2), np.int64),
     )
@@ -952,8 +978,7 @@ def start_car(cars, roads, n, path, tiles, lap_complete):
         for k in range(2):
             car.force[body, k] = ZERO
     for i in range(WHEELS):
-        for k in range(4):
-            car.impulse[i, k] = ZERO
+        car.push[i, 0] = car.push[i, 1] = car.motor[i] = car.stop[i] = ZERO
         car.at_stop[i], car.on_road[i], car.motor_speed[i] = 0, 0, ZERO
         car.steer[i] = car.gas[i] = car.brake[i] = car.omega[i] = car.phase[i] = 0.0
     car.time = car.reward = car.previous_reward = 0.0
