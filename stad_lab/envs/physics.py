@@ -1,13 +1,13 @@
 """The physics of the car, compiled with Numba: a frame of CarRacing-v3 without its picture.
 
-The car is five rigid bodies in the plane, the hull and four wheels. A revolute joint holds each wheel
-to the hull: it keeps two points together, and lets the wheel turn against the hull between two stops.
-A motor in the joint steers. There is no gravity and nothing collides; road tiles only report that they
-are touched. One frame goes in this order.
+The car is five rigid bodies in the plane, the hull and four wheels. A revolute joint holds each
+wheel to the hull: it keeps two points together, and lets the wheel turn against the hull between
+two stops. A motor in the joint steers. There is no gravity and nothing collides; road tiles only
+report that they are touched. One frame goes in this order.
 
-1. `drive_wheels`: throttle, brakes and steering act, and each tyre pushes its wheel. The tyre's force
-   grows with the difference between the speed of the ground and that of the tread, up to a limit that
-   depends on the ground. These are the equations of Gymnasium's `Car.step`, in float64.
+1. `drive_wheels`: throttle, brakes and steering act, and each tyre pushes its wheel. The tyre's
+   force grows with the difference between the speed of the ground and that of the tread, up to a
+   limit that depends on the ground. These are the equations of Gymnasium's `Car.step`, in float64.
 2. `touch_tiles`: which tiles does the car touch? New ones are rewarded.
 3. `solve`: one time step of rigid-body dynamics, in float32.
    - Forces change velocities (`apply_forces`).
@@ -21,27 +21,30 @@ The two points at the joint should move alike, so the velocity error
 
     e = v_B + w_B x r_B - v_A - w_A x r_A
 
-should be zero. An impulse p at the joint, on B, and -p, on A, changes e by K p, where the 2 x 2 matrix
-K depends on the masses, the moments of inertia and r_A, r_B. So p = -K^-1 e repairs this joint at once.
-At a stop, the difference of the spins is a third component of e, and K is a 3 x 3 matrix; the stop may
-only push. All joints share the hull, so each repair spoils the others a little. Going round
-and round (projected Gauss-Seidel) converges to the impulses that satisfy all of them, and since the
-impulses of the last frame are applied first (warm starting), most of the work is already done.
+should be zero. An impulse p on B and -p on A, both at the joint, changes e by K p, where the 2 x 2
+matrix K depends on the masses, the moments of inertia, r_A and r_B. So p = -K^-1 e repairs this
+joint at once. At a stop, the difference of the spins is a third component of e, and K is a 3 x 3
+matrix; a stop may only push. All joints share the hull, so repairing one spoils the others a
+little. Sweeping over them again and again (projected Gauss-Seidel) converges to impulses that
+satisfy all. The impulses of the last frame are applied first (warm starting), so little is left to
+correct.
 
-**Why sweeps may stop early.** Gymnasium asks for 180 sweeps over the joints. A sweep is a function of
-the velocities and the accumulated impulses, 31 numbers, and of nothing else that changes. Once a sweep
-returns numbers that occurred before, all further sweeps only repeat the cycle from there. In most
-frames a fixed point (a cycle of length 1) is reached after a few sweeps; at the stops, longer
-cycles occur. We find the cycle and skip whole rounds of it: the result is the same, to the last bit.
+**Why sweeps may stop early.** Gymnasium asks for 180 sweeps in each frame. What a sweep does
+depends on the velocities and on the accumulated impulses of motors and stops: 23 numbers. In most
+frames rounding soon brings them to a fixed point or a short cycle, and all further sweeps repeat
+it. The accumulated impulses of the points are not read by the sweeps, only added to. So we
+find the cycle, add its impulses as often as they would have been added, and leave out the sweeps.
+The result is the same to the last bit.
 
-**Equality with Box2D.** The method, its constants and the order of all float32 operations are those of
-Box2D 2.3 (Erin Catto, https://box2d.org), the library behind Gymnasium. The code is our own. On Linux
-x86-64 all bodies agree to the last bit, as `tests/envs/test_physics.py` shows. On other processors a compiler
-may fuse a product and a sum into one rounding, and another C library may round `sin` differently;
-there, trajectories agree to within rounding, which grows with time.
+**Equality with Box2D.** The method, its constants and the order of all float32 operations are those
+of Box2D 2.3 (Erin Catto, https://box2d.org), the library behind Gymnasium. The code is our own. On
+Linux x86-64 all bodies agree to the last bit, as `tests/envs/test_physics.py` shows. On other
+processors a compiler may fuse a product and a sum into one rounding, and another C library may
+round `sin` differently. There, trajectories agree at first and drift apart as rounding errors grow.
 
-A car is one record of the NumPy dtype `CAR`, and the tiles around it are one record of `ROAD`, so a
-batch of cars is two arrays, and copying an array copies everything.
+A car is one record of the NumPy dtype `CAR`, and the tiles around it are one record of `ROAD`. A
+batch of cars is two arrays, and copying them copies the whole state. All compiled functions are in
+this file, since Numba's cache does not notice when a function in another file changes.
 """
 
 import math
@@ -79,13 +82,13 @@ WHEEL_POLYGON = [(-14, 27), (14, 27), (14, -27), (-14, -27)]
 # --- Box2D's constants, float32 -------------------------------------------------------------------
 
 ZERO, HALF, ONE, TWO = f32(0), f32(0.5), f32(1), f32(2)
-EPSILON = np.finfo(f32).eps
 PI = f32(3.14159265359)
 STEP = f32(FRAME)
 VELOCITY_SWEEPS, POSITION_SWEEPS = 6 * 30, 2 * 30  # at most, as Gymnasium asks for
 STOP = f32(0.4)  # radians, the largest steering angle
 MOTOR_IMPULSE = STEP * f32(180 * 900 * SIZE * SIZE)  # the largest impulse of a motor in one step
-LINEAR_SLOP, ANGULAR_SLOP = f32(0.005), TWO / f32(180) * PI  # errors of positions that are left alone
+LINEAR_SLOP = f32(0.005)  # errors of positions up to these are left alone
+ANGULAR_SLOP = TWO / f32(180) * PI
 MAX_TURN_BACK = f32(8) / f32(180) * PI  # radians, the largest correction at a stop
 MAX_TRANSLATION = TWO  # world units in one step
 MAX_ROTATION = HALF * PI  # radians in one step
@@ -93,6 +96,7 @@ REST_SPEED, REST_SPIN = f32(0.01), TWO / f32(180) * PI  # below these a body cou
 TIME_TO_SLEEP = HALF  # seconds at rest until velocities are set to zero
 SKIN = TWO * LINEAR_SLOP  # every polygon is this much thicker than drawn
 OVERLAP = f32(10) * np.finfo(f32).eps  # at a smaller distance of their skins, polygons touch
+SHORTEST = np.finfo(f32).eps * np.finfo(f32).eps  # square of the shortest vector with a direction
 GJK_STEPS = 20
 
 # Ours: bounds that are far wider than any rounding error, so that no answer depends on them.
@@ -101,7 +105,8 @@ CLEAR_GAP = f32(0.03)  # at a larger distance, polygons do not touch; two skins 
 
 # --- Records --------------------------------------------------------------------------------------
 
-HULL, BODIES, WHEELS = 0, 5, 4  # body 0 is the hull, body 1 + i is wheel i
+BODIES, WHEELS = 5, 4  # body 0 is the hull, body 1 + i is wheel i
+HULL = np.int64(0)  # a NumPy number: Numba compiles a function anew for each Python constant
 DRIVING, LAP_FINISHED, LEFT_FIELD = 0, 1, 2  # values of `ending`
 
 CAR = np.dtype(
@@ -110,7 +115,7 @@ CAR = np.dtype(
         ("center", "f4", (BODIES, 2)),  # centre of mass
         ("angle", "f4", BODIES),
         ("velocity", "f4", (BODIES, 3)),  # of the centre of mass: x, y, and spin
-        ("position", "f4", (BODIES, 2)),  # origin of the body's own coordinates; Gymnasium's position
+        ("position", "f4", (BODIES, 2)),  # origin of the body's own coordinates
         ("rotation", "f4", (BODIES, 2)),  # cosine and sine of `angle`
         ("force", "f4", (BODIES, 2)),
         ("rest", "f4", BODIES),  # seconds at rest
@@ -157,7 +162,7 @@ ROAD = np.dtype(
 # --- Shapes and masses ----------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def convex_hull(points, hull):
     """Wrap points as Box2D does: from the rightmost one, counter-clockwise, without collinear ones.
 
@@ -170,12 +175,12 @@ def convex_hull(points, hull):
     """
     start = 0
     for i in range(1, len(points)):
-        x, y = points[i]
+        x, y = points[i, 0], points[i, 1]
         if x > points[start, 0] or (x == points[start, 0] and y < points[start, 1]):
             start = i
     count, corner = 0, start
     while True:
-        hull[count] = points[corner]
+        hull[count, 0], hull[count, 1] = points[corner, 0], points[corner, 1]
         count += 1
         end = 0
         for i in range(1, len(points)):
@@ -230,7 +235,7 @@ def polygon_mass(polygon: np.ndarray, density: np.float32) -> tuple:
 
 
 def body_mass(polygons: list[np.ndarray], density: np.float32) -> tuple:
-    """Inverse mass, inverse moment of inertia about the centre, and the centre (x, y), of a body."""
+    """Inverse mass, inverse moment of inertia about the centre, and centre (x, y) of a body."""
     mass, moment, x, y = ZERO, ZERO, ZERO, ZERO
     for polygon in reversed(polygons):  # Box2D keeps the last one first
         part, center, part_moment = polygon_mass(polygon, density)
@@ -247,17 +252,18 @@ HULL_SHAPES = [make_polygon(polygon) for polygon in HULL_POLYGONS]
 HULL_INV_MASS, HULL_INV_INERTIA, HULL_CENTER = body_mass(HULL_SHAPES, ONE)
 WHEEL_INV_MASS, WHEEL_INV_INERTIA, WHEEL_CENTER = body_mass([WHEEL_SHAPE], f32(0.1))
 TURN_MASS = ONE / (HULL_INV_INERTIA + WHEEL_INV_INERTIA)  # what a motor or a stop has to turn
-# From the hull's centre of mass to the joints, float32 (4, 2), in the hull's own coordinates. A joint
-# sits in the centre of its wheel, so r_B is zero in all formulas, and we leave it out.
+# From the hull's centre of mass to the joints, float32 (4, 2), in the hull's own coordinates. A
+# joint sits in the centre of its wheel, so r_B is zero in all formulas, and we leave it out.
 ANCHORS = (np.array(WHEEL_PLACES) * SIZE).astype(f32) - np.array(HULL_CENTER)
 WHEEL_OFFSETS = np.array(WHEEL_PLACES) * SIZE  # from the hull's origin, float64 (4, 2)
 CENTERS = np.array([HULL_CENTER] + [WHEEL_CENTER] * WHEELS)  # of all bodies, float32 (5, 2)
-# All polygons of the car: the four of the hull, then the wheel. Rows beyond SHAPE_CORNERS are unused.
+# All polygons of the car: the four of the hull, then the wheel. Rows beyond SHAPE_CORNERS are
+# unused.
 SHAPES = np.zeros((len(HULL_SHAPES) + 1, 8, 2), f32)
 SHAPE_CORNERS = np.array([len(shape) for shape in [*HULL_SHAPES, WHEEL_SHAPE]])
 for _row, _shape in zip(SHAPES, [*HULL_SHAPES, WHEEL_SHAPE], strict=True):
     _row[: len(_shape)] = _shape
-WHEEL = len(HULL_SHAPES)  # the wheel's row in SHAPES
+WHEEL = np.int64(len(HULL_SHAPES))  # the wheel's row in SHAPES
 
 
 # --- 1. Throttle, brakes, steering and tyres ------------------------------------------------------
@@ -265,7 +271,7 @@ WHEEL = len(HULL_SHAPES)  # the wheel's row in SHAPES
 
 @njit(cache=True, nogil=True)
 def control(car, steering, gas, brake):
-    """Set the controls as Gymnasium does: gas rises by at most 0.1 a frame, the rest acts at once."""
+    """Set the controls. Gas rises by at most 0.1 a frame, everything else acts at once."""
     car.steer[0] = car.steer[1] = -steering
     gas = min(max(gas, 0.0), 1.0)
     for i in range(2, 4):  # rear-wheel drive
@@ -305,7 +311,7 @@ def drive_wheels(car):
 
 @njit(cache=True, nogil=True)
 def slow_down(omega, brake):
-    """The rotation of a wheel after braking for one frame; from 0.9 on the brake locks the wheel."""
+    """The rotation of a wheel after braking for one frame. From 0.9 on the brake locks it."""
     if brake >= 0.9:
         return 0.0
     if brake > 0:
@@ -321,8 +327,8 @@ def touch_tiles(car, road, simplex, corners):
     """Find the tiles under the car, before it moves, and reward those that a wheel touches first.
 
     A tile that any part of the car has touched is `darkened`, which only the picture shows.
-    Box2D first pairs fattened bounding boxes. That never hides a touch: a box is fattened by 0.1, and
-    polygons touch at a gap of 0.02. So we may choose candidates in our own way.
+    Box2D first pairs fattened bounding boxes. That never hides a touch: a box is fattened by 0.1,
+    and polygons touch at a gap of 0.02. So we may choose candidates in our own way.
 
     Args:
         car, road: records, are changed.
@@ -362,7 +368,7 @@ def touch_tiles(car, road, simplex, corners):
 
 @njit(cache=True, nogil=True)
 def wheel_touches(car, i, road, tile, simplex, corners):
-    """Whether wheel i touches a tile. Only where rounding could decide, Box2D's own test is made."""
+    """Whether wheel i touches a tile. Where rounding could decide, Box2D's own test is made."""
     x, y = car.position[1 + i, 0], car.position[1 + i, 1]
     cosine, sine = car.rotation[1 + i, 0], car.rotation[1 + i, 1]
     inside = True
@@ -395,20 +401,20 @@ def polygons_touch(road, tile, car, body, shape, simplex, corners):
         corners: int64 (6, 2), memory: the numbers of a and b of each row; then those before the
             last drop.
     """
-    count = 1
-    add_corner(road, tile, car, body, shape, 0, 0, simplex[0], corners[0])
+    count = np.int64(1)
+    add_corner(road, tile, car, body, shape, count - 1, count - 1, simplex[0], corners[0])
     simplex[0, 6] = ONE
     for _ in range(GJK_STEPS):
         before = count
-        corners[3:] = corners[:3]
-        if count == 2:
-            count = nearest_on_edge(simplex, corners)
-        elif count == 3:
-            count = nearest_on_triangle(simplex, corners)
-        if count == 3:
-            return True  # the origin lies within the triangle
+        for k in range(3):
+            corners[3 + k, 0], corners[3 + k, 1] = corners[k, 0], corners[k, 1]
+        if count > 1:
+            count, j, k, weight_j, weight_k = nearest_point(simplex, count)
+            if count == 3:
+                return True  # the origin lies within the triangle
+            keep_corners(simplex, corners, j, k, weight_j, weight_k)
         dx, dy = towards_origin(simplex, count)
-        if dx * dx + dy * dy < f32(EPSILON * EPSILON):
+        if dx * dx + dy * dy < SHORTEST:
             break
         a = furthest_on_tile(road, tile, -dx, -dy)
         b = furthest_on_car(car, body, shape, dx, dy)
@@ -472,85 +478,64 @@ def towards_origin(simplex, count):
 
 
 @njit(cache=True, nogil=True)
-def keep_corner(simplex, corners, k, row):
-    """Move corner k of the simplex to a row, with its numbers."""
-    simplex[row] = simplex[k]
-    corners[row] = corners[k]
-
-
-@njit(cache=True, nogil=True)
-def keep_edge(simplex, corners, j, k, weight_j, weight_k):
-    """Reduce the simplex to the edge j, k, given the unscaled weights of the nearest point."""
-    scale = ONE / (weight_j + weight_k)
-    simplex[j, 6], simplex[k, 6] = weight_j * scale, weight_k * scale
-    if j == 1:  # Box2D's order: corner 2 takes the place of corner 0
-        keep_corner(simplex, corners, 2, 0)
-    elif k == 2:
-        keep_corner(simplex, corners, 2, 1)
-    return 2
-
-
-@njit(cache=True, nogil=True)
-def keep_point(simplex, corners, k):
-    """Reduce the simplex to one corner."""
-    keep_corner(simplex, corners, k, 0)
-    simplex[0, 6] = ONE
-    return 1
-
-
-@njit(cache=True, nogil=True)
-def along(simplex, j, k, point):
-    """The product of the vector from corner j to corner k with a corner."""
-    ex, ey = simplex[k, 4] - simplex[j, 4], simplex[k, 5] - simplex[j, 5]
-    return simplex[point, 4] * ex + simplex[point, 5] * ey
-
-
-@njit(cache=True, nogil=True)
 def cross(ax, ay, bx, by):
+    """The cross product of two vectors."""
     return ax * by - ay * bx
 
 
 @njit(cache=True, nogil=True)
-def nearest_on_edge(simplex, corners):
-    """Find the point of an edge nearest to the origin; return how many corners it needs."""
-    weight_1 = -along(simplex, 0, 1, 0)
-    if weight_1 <= ZERO:
-        return keep_point(simplex, corners, 0)
-    weight_0 = along(simplex, 0, 1, 1)
-    if weight_0 <= ZERO:
-        return keep_point(simplex, corners, 1)
-    return keep_edge(simplex, corners, 0, 1, weight_0, weight_1)
+def along(ax, ay, bx, by):
+    """The weights of a and b, up to a common factor, in the point of line ab nearest to zero."""
+    ex, ey = bx - ax, by - ay
+    return bx * ex + by * ey, -(ax * ex + ay * ey)
 
 
 @njit(cache=True, nogil=True)
-def nearest_on_triangle(simplex, corners):
-    """Find the point of a triangle nearest to the origin; return how many corners it needs.
+def nearest_point(simplex, count):
+    """Find the point of an edge or a triangle nearest to the origin.
 
-    The nearest point lies at a corner, on an edge or inside; the signs of areas tell which. `on_jk_j`
-    is the unscaled weight of corner j in the point of edge jk nearest to the origin.
+    It lies at a corner, on an edge or inside; the signs of weights and areas tell which.
+
+    Returns:
+        how many corners this point needs, two corners j and k, and their weights up to a common
+        factor. If it needs one only, that is j.
     """
-    on_01_0, on_01_1 = along(simplex, 0, 1, 1), -along(simplex, 0, 1, 0)
-    on_02_0, on_02_2 = along(simplex, 0, 2, 2), -along(simplex, 0, 2, 0)
-    on_12_1, on_12_2 = along(simplex, 1, 2, 2), -along(simplex, 1, 2, 1)
     x0, y0, x1, y1 = simplex[0, 4], simplex[0, 5], simplex[1, 4], simplex[1, 5]
+    on_01_0, on_01_1 = along(x0, y0, x1, y1)
+    if count == 2:
+        if on_01_1 <= ZERO:
+            return 1, 0, 1, ONE, ZERO
+        if on_01_0 <= ZERO:
+            return 1, 1, 1, ONE, ZERO
+        return 2, 0, 1, on_01_0, on_01_1
     x2, y2 = simplex[2, 4], simplex[2, 5]
+    on_02_0, on_02_2 = along(x0, y0, x2, y2)
+    on_12_1, on_12_2 = along(x1, y1, x2, y2)
     area = cross(x1 - x0, y1 - y0, x2 - x0, y2 - y0)
-    inside_0 = area * cross(x1, y1, x2, y2)
-    inside_1 = area * cross(x2, y2, x0, y0)
-    inside_2 = area * cross(x0, y0, x1, y1)
     if on_01_1 <= ZERO and on_02_2 <= ZERO:
-        return keep_point(simplex, corners, 0)
-    if on_01_0 > ZERO and on_01_1 > ZERO and inside_2 <= ZERO:
-        return keep_edge(simplex, corners, 0, 1, on_01_0, on_01_1)
-    if on_02_0 > ZERO and on_02_2 > ZERO and inside_1 <= ZERO:
-        return keep_edge(simplex, corners, 0, 2, on_02_0, on_02_2)
+        return 1, 0, 1, ONE, ZERO
+    if on_01_0 > ZERO and on_01_1 > ZERO and area * cross(x0, y0, x1, y1) <= ZERO:
+        return 2, 0, 1, on_01_0, on_01_1
+    if on_02_0 > ZERO and on_02_2 > ZERO and area * cross(x2, y2, x0, y0) <= ZERO:
+        return 2, 0, 2, on_02_0, on_02_2
     if on_01_0 <= ZERO and on_12_2 <= ZERO:
-        return keep_point(simplex, corners, 1)
+        return 1, 1, 1, ONE, ZERO
     if on_02_0 <= ZERO and on_12_1 <= ZERO:
-        return keep_point(simplex, corners, 2)
-    if on_12_1 > ZERO and on_12_2 > ZERO and inside_0 <= ZERO:
-        return keep_edge(simplex, corners, 1, 2, on_12_1, on_12_2)
-    return 3
+        return 1, 2, 1, ONE, ZERO
+    if on_12_1 > ZERO and on_12_2 > ZERO and area * cross(x1, y1, x2, y2) <= ZERO:
+        return 2, 2, 1, on_12_2, on_12_1
+    return 3, 0, 1, ZERO, ZERO
+
+
+@njit(cache=True, nogil=True)
+def keep_corners(simplex, corners, j, k, weight_j, weight_k):
+    """Move the corners j and k of the simplex to its rows 0 and 1, and store their weights."""
+    scale = ONE / (weight_j + weight_k)
+    for row, corner, weight in ((0, j, weight_j), (1, k, weight_k)):
+        for n in range(6):
+            simplex[row, n] = simplex[corner, n]
+        simplex[row, 6] = weight * scale
+        corners[row, 0], corners[row, 1] = corners[corner, 0], corners[corner, 1]
 
 
 @njit(cache=True, nogil=True)
@@ -569,13 +554,14 @@ def skins_overlap(simplex, count):
 
 
 # --- 3. Rigid bodies ------------------------------------------------------------------------------
-# In the sweeps, `state` is float32 (24,): the velocities of the five bodies (x, y, spin), one number
-# that is not used, and the accumulated impulses of the four motors and of the four stops.
+# In the sweeps, `state` is float32 (24,): the velocities of the five bodies (x, y, spin), one
+# number that is not used, and the accumulated impulses of the four motors and of the four stops.
 
 MOTOR, STOPPER = 16, 20  # where these impulses begin in `state`
 STATE_SIZE = 24
-# What a joint needs in the sweeps, in its row of `joints`: r_A, the matrix K in the plane, its third
-# column, the reciprocals of the two determinants, and the product of its second and third column.
+# What a joint needs in the sweeps, in its row of `joints`: r_A, the matrix K in the plane, its
+# third column, the reciprocals of the two determinants, and the product of its second and third
+# column.
 RX, RY, K11, K12, K22, K13, K23, SCALE2, SCALE3, NX, NY, NZ = range(12)
 K33 = HULL_INV_INERTIA + WHEEL_INV_INERTIA
 
@@ -663,13 +649,14 @@ def prepare_joints(car, state, joints):
 def solve_velocities(car, state, saved, joints, pushes):
     """Sweep over the joints `VELOCITY_SWEEPS` times, or skip what only repeats itself.
 
-    To find a cycle we keep `state` of one earlier sweep, and replace it after 1, 2, 4, 8, ... sweeps
-    (R. P. Brent's method). If it returns after n sweeps, the next n sweeps are the whole cycle:
-    their pushes are added again and again, one by one as the sweeps would do, and the sweeps that are
-    left when less than a cycle remains are done.
+    To find a cycle we keep `state` of one earlier sweep, and replace it after 1, 2, 4, 8, ...
+    sweeps (R. P. Brent's method). If it returns after n sweeps, the next n sweeps are the whole
+    cycle: their pushes are added again and again, one by one as the sweeps would do, and the sweeps
+    that are left when less than a cycle remains are done.
     """
     bits, saved_bits = state.view(np.int32), saved.view(np.int32)
-    saved_bits[:] = bits
+    for k in range(STATE_SIZE):
+        saved_bits[k] = bits[k]
     left, age, renew = VELOCITY_SWEEPS, 0, 1
     while left > 0:
         sweep(car, state, joints, pushes[0])
@@ -682,7 +669,8 @@ def solve_velocities(car, state, saved, joints, pushes):
         if changed == 0:
             break
         if age == renew:
-            saved_bits[:] = bits
+            for k in range(STATE_SIZE):
+                saved_bits[k] = bits[k]
             age, renew = 0, 2 * renew
     rounds = left // age if age > 0 else 0
     if rounds > 0:
@@ -993,7 +981,8 @@ def lay_road(road, tiles):
     road.tiles = len(tiles)
     corners, hull = np.empty((4, 2), np.float32), np.empty((4, 2), np.float32)
     for tile in range(len(tiles)):
-        corners[:] = tiles[tile]
+        for k in range(4):
+            corners[k, 0], corners[k, 1] = tiles[tile, k, 0], tiles[tile, k, 1]
         count = convex_hull(corners, hull)
         road.corner_count[tile] = count
         road.visited[tile] = road.darkened[tile] = 0
@@ -1002,8 +991,10 @@ def lay_road(road, tiles):
         for k in range(count):
             x, y = hull[k, 0], hull[k, 1]
             road.corners[tile, k, 0], road.corners[tile, k, 1] = x, y
-            road.box[tile, 0], road.box[tile, 1] = min(road.box[tile, 0], x), min(road.box[tile, 1], y)
-            road.box[tile, 2], road.box[tile, 3] = max(road.box[tile, 2], x), max(road.box[tile, 3], y)
+            road.box[tile, 0] = min(road.box[tile, 0], x)
+            road.box[tile, 1] = min(road.box[tile, 1], y)
+            road.box[tile, 2] = max(road.box[tile, 2], x)
+            road.box[tile, 3] = max(road.box[tile, 3], y)
             end = (k + 1) % count
             nx, ny = hull[end, 1] - y, x - hull[end, 0]
             length = math.sqrt(nx * nx + ny * ny)

@@ -1,17 +1,18 @@
-"""The race track: the same closed road as Gymnasium's CarRacing-v3 draws for every seed, compiled with Numba.
+"""The race track: for every seed the closed road of Gymnasium's CarRacing-v3, compiled with Numba.
 
 A track is made in four steps.
 
 1. Twelve checkpoints are drawn around the origin, with random angle and radius.
-2. A point moves in steps of fixed length from checkpoint to checkpoint, for about five laps. In each step it turns
-   towards the next checkpoint, by at most `TURN_RATE`. The points that it passes are the path.
-3. The second lap is cut out. If its two ends do not meet, the track is refused and new checkpoints are drawn.
-4. Every two neighbouring points of the path span a road tile. Where the road bends sharply, it gets a kerb on the
-   outside.
+2. A point moves in steps of fixed length from checkpoint to checkpoint, for about five laps. In
+   each step it turns towards the next checkpoint, by at most `TURN_RATE`. The points it visits are
+   the path.
+3. One lap is cut out. If its two ends do not meet, the track is refused and drawn again.
+4. Every two neighbouring points of the path span a road tile. Where the road bends sharply, a tile
+   has a kerb on its outside.
 
-The method and all constants are from `CarRacing._create_track` in Gymnasium (Oleg Klimov). All arithmetic is float64 in
-the same order of operations, so that the vertices are equal to the last bit wherever Python and Numba call the same
-`sin`, `cos` and `atan2`.
+The method and all constants are those of `CarRacing._create_track` in Gymnasium (Oleg Klimov). All
+arithmetic is float64 in the same order of operations. So all vertices are equal to the last bit
+where Python and Numba use the same C library for `sin`, `cos` and `atan2`.
 """
 
 import math
@@ -20,16 +21,16 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-SCALE = 6.0  # Gymnasium's unit of length: it divides all sizes of the track by it
-TRACK_RADIUS = 900 / SCALE  # world units; checkpoints lie at 1/3 to 1 of it, the first and last at 3/2
+SCALE = 6.0  # Gymnasium divides all sizes of the track by it
+TRACK_RADIUS = 900 / SCALE  # world units; most checkpoints lie at 1/3 to 1 of it
 STEP_LENGTH = 21 / SCALE  # world units from one point of the path to the next, the length of a tile
 TURN_RATE = 0.31  # radians, the sharpest turn in one step
 TRACK_WIDTH = 40 / SCALE  # half the width of the road, world units
 KERB_WIDTH = 8 / SCALE  # world units
-KERB_TILES = 4  # a bend gets a kerb when so many steps in a row turn sharply to the same side
+KERB_TILES = 4  # a kerb needs so many sharp turns in a row to the same side
 CHECKPOINTS = 12
 MAX_TILES = 2500  # the path is cut after so many steps, so no track has more tiles
-START_ANGLE = 2 * math.pi * (-0.5) / CHECKPOINTS  # where a lap begins, seen from the origin, radians
+START_ANGLE = 2 * math.pi * (-0.5) / CHECKPOINTS  # radians, where a lap begins
 KERB_COLORS = np.array([[255, 255, 255], [255, 0, 0]], np.uint8)  # of even and of odd tiles
 
 
@@ -37,11 +38,12 @@ class Track(NamedTuple):
     """One track of `n` tiles and `k` kerbs. Lengths are in world units, angles in radians.
 
     Attributes:
-        path: float64 (n, 4): for each point of the centre line its angle seen from the origin, the heading of the road,
-            x and y. The car starts at point 0. (Gymnasium's `env.track`.)
+        path: float64 (n, 4): for each point of the centre line its angle seen from the origin, the
+            heading of the road, x and y. The car starts at point 0. (Gymnasium's `env.track`.)
         tiles: float64 (n, 4, 2): corners of tile i, between the points i and i - 1 of the path.
         kerbs: float64 (k, 4, 2): corners of the kerbs.
-        kerb_tiles: int64 (k,), increasing: the tile beside which each kerb lies. Gymnasium draws it after that tile.
+        kerb_tiles: int64 (k,), increasing: the tile of each kerb. Gymnasium draws the kerb after
+        it.
         kerb_colors: uint8 (k, 3): white beside even tiles, red beside odd ones.
     """
 
@@ -56,7 +58,8 @@ def make_track(random: np.random.Generator) -> Track:
     """Generate a track, drawing again until the road closes.
 
     Args:
-        random: the environment's generator, `env.np_random`. It is left in the same state as by Gymnasium.
+        random: the environment's generator, `env.np_random`. It is left in the same state as by
+        Gymnasium.
     """
     lows, highs = np.zeros((CHECKPOINTS, 2)), np.empty((CHECKPOINTS, 2))
     lows[:, 1] = TRACK_RADIUS / 3
@@ -68,9 +71,17 @@ def make_track(random: np.random.Generator) -> Track:
 
 
 def tile_colors(count: int, road_color: np.ndarray) -> np.ndarray:
-    """Colours of tiles that no car has touched: three shades in turn, float64 (count, 3), 0 to 255.
+    """Colours of tiles that the car has not touched: three shades in turn, 0 to 255.
 
-    Once a car touches a tile, Gymnasium paints it in `road_color` itself, the darkest of the three.
+    Once the car touches a tile, Gymnasium paints it in `road_color` itself, the darkest of the
+    three.
+
+    Args:
+        count: number of tiles.
+        road_color: (3,).
+
+    Returns:
+        float64 (count, 3).
     """
     return road_color + (0.01 * (np.arange(count) % 3) * 255)[:, None]
 
@@ -90,7 +101,7 @@ def find_path(draws):
     if first < 0:
         return track[:0].copy()
     track = track[first : last - 1].copy()
-    # The gap between head and tail, each component weighted with the direction across the road at the start.
+    # The gap between head and tail. Each component is weighted with the direction across the road.
     across_x, across_y = math.cos(track[0, 1]), math.sin(track[0, 1])
     gap_x = across_x * (track[0, 2] - track[-1, 2])
     gap_y = across_y * (track[0, 3] - track[-1, 3])
@@ -120,10 +131,10 @@ def place_checkpoints(draws):
 
 @njit(cache=True, nogil=True)
 def walk(checkpoints):
-    """Step 2: go from checkpoint to checkpoint; float64 (steps, 4) as `Track.path`, about five laps."""
+    """Step 2: go from checkpoint to checkpoint; float64 (steps, 4) as `Track.path`."""
     track = np.empty((MAX_TILES, 4))
     x, y, beta = 1.5 * TRACK_RADIUS, 0.0, 0.0
-    goal = 0
+    goal = np.int64(0)
     laps = 0
     visited_other_side = False
     steps = 0
@@ -138,7 +149,8 @@ def walk(checkpoints):
         goal, alpha = next_checkpoint(checkpoints, goal, alpha)
         goal_x, goal_y = checkpoints[goal % CHECKPOINTS, 1], checkpoints[goal % CHECKPOINTS, 2]
 
-        # (side_x, side_y) points to the right of the heading; the projection says how far the goal lies to that side.
+        # (side_x, side_y) points to the right; the projection says how far to the right the goal
+        # lies.
         side_x, side_y = math.cos(beta), math.sin(beta)
         ahead_x, ahead_y = -side_y, side_x
         projection = side_x * (goal_x - x) + side_y * (goal_y - y)
@@ -163,7 +175,7 @@ def walk(checkpoints):
 
 @njit(cache=True, nogil=True)
 def next_checkpoint(checkpoints, goal, alpha):
-    """The next checkpoint ahead of the angle `alpha`, and `alpha`, reduced by full turns where a lap is over."""
+    """The next checkpoint beyond the angle `alpha`, and `alpha`, less a full turn after a lap."""
     while True:
         while True:
             if alpha <= checkpoints[goal % CHECKPOINTS, 0]:
@@ -192,7 +204,7 @@ def pave(path):
     count = len(path)
     border = find_bends(path)
     tiles = np.empty((count, 4, 2))
-    kerbs = np.empty((border.sum(), 4, 2))
+    kerbs = np.empty((np.count_nonzero(border), 4, 2))
     kerb_tiles = np.empty(len(kerbs), np.int64)
     kerb_colors = np.empty((len(kerbs), 3), np.uint8)
     kerb = 0
@@ -202,14 +214,15 @@ def pave(path):
             side = np.sign(path[i - 1, 1] - path[i, 1])
             span(path, i, side * TRACK_WIDTH, side * (TRACK_WIDTH + KERB_WIDTH), kerbs[kerb])
             kerb_tiles[kerb] = i
-            kerb_colors[kerb] = KERB_COLORS[i % 2]
+            for channel in range(3):
+                kerb_colors[kerb, channel] = KERB_COLORS[i % 2, channel]
             kerb += 1
     return tiles, kerbs, kerb_tiles, kerb_colors
 
 
 @njit(cache=True, nogil=True)
 def span(path, i, left, right, corners):
-    """Write the corners of a strip between the points i and i - 1, `left` to `right` of the centre line."""
+    """Write the corners of a strip from point i back to i - 1, `left` to `right` of the centre."""
     for end in range(2):
         beta, x, y = path[i - end, 1], path[i - end, 2], path[i - end, 3]
         across_x, across_y = math.cos(beta), math.sin(beta)
@@ -231,7 +244,8 @@ def find_bends(path):
             good &= abs(turn) > TURN_RATE * 0.2
             one_side += np.sign(turn)
         border[i] = good and abs(one_side) == KERB_TILES
-    # A kerb begins some tiles before the bend. What wraps around behind tile 0 spreads again when its turn comes.
+    # A kerb begins some tiles before the bend. As in Gymnasium, what spreads from the first tiles
+    # to the last ones spreads again when their turn comes.
     for i in range(count):
         if border[i]:
             for back in range(KERB_TILES):
