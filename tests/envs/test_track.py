@@ -2,6 +2,7 @@
 
 import platform
 
+import Box2D
 import gymnasium
 import numpy as np
 import pytest
@@ -21,8 +22,7 @@ def make_reference(world, random):
     """Let Gymnasium generate a track, with the loop of its `reset`."""
     world._np_random = random
     while True:
-        for tile in world.road or []:
-            world.world.DestroyBody(tile)
+        world.world = Box2D.b2World((0, 0))  # new, since destroying tiles gets slower and slower
         world.road_poly = []
         if world._create_track():
             return
@@ -60,7 +60,7 @@ def test_tracks_equal_gymnasiums(world):
 
 @pytest.mark.long
 def test_thousands_of_tracks_equal_gymnasiums(world):
-    for seed in range(1000, 6000):
+    for seed in range(1000, 4000):
         compare_track(world, seed)
 
 
