@@ -328,7 +328,9 @@ def touch_tiles(car, road, simplex, corners):
 
     A tile that any part of the car has touched is `darkened`, which only the picture shows.
     Box2D first pairs fattened bounding boxes. That never hides a touch: a box is fattened by 0.1,
-    and polygons touch at a gap of 0.02. So we may choose candidates in our own way.
+    and polygons touch at a gap of 0.02. So we may choose candidates in our own way. Tiles come in
+    descending order, as Box2D reports them in a new world. The order matters only where tile 0 and
+    others are new in the same frame and `lap_complete` lies between their shares.
 
     Args:
         car, road: records, are changed.
@@ -649,29 +651,30 @@ def prepare_joints(car, state, joints):
 def solve_velocities(car, state, saved, joints, pushes):
     """Sweep over the joints `VELOCITY_SWEEPS` times, or skip what only repeats itself.
 
-    To find a cycle we keep `state` of one earlier sweep, and replace it after 1, 2, 4, 8, ...
-    sweeps (R. P. Brent's method). If it returns after n sweeps, the next n sweeps are the whole
-    cycle: their pushes are added again and again, one by one as the sweeps would do, and the sweeps
-    that are left when less than a cycle remains are done.
+    To find a cycle we compare `state` with that of an earlier sweep, which we replace now and then,
+    after ever more sweeps. If it returns after n sweeps, the next n sweeps are the whole cycle:
+    their pushes are added again and again, one by one as the sweeps would do. Only the sweeps that
+    do not fill a cycle are left.
     """
     bits, saved_bits = state.view(np.int32), saved.view(np.int32)
     for k in range(STATE_SIZE):
         saved_bits[k] = bits[k]
-    left, age, renew = VELOCITY_SWEEPS, 0, 1
-    while left > 0:
+    done, age = 0, 0  # sweeps so far, and since the state was saved
+    while done < VELOCITY_SWEEPS:
         sweep(car, state, joints, pushes[0])
         add_push(car, pushes[0])
-        left -= 1
+        done += 1
         age += 1
         changed = np.int32(0)
         for k in range(STATE_SIZE):
             changed |= bits[k] ^ saved_bits[k]
         if changed == 0:
             break
-        if age == renew:
+        if age >= max(2, done // 2):
             for k in range(STATE_SIZE):
                 saved_bits[k] = bits[k]
-            age, renew = 0, 2 * renew
+            age = 0
+    left = VELOCITY_SWEEPS - done
     rounds = left // age if age > 0 else 0
     if rounds > 0:
         for n in range(age):
@@ -892,6 +895,7 @@ def advance(car, road, memory):
 @njit(cache=True, nogil=True)
 def score(car, road):
     """The reward of a frame, float64; sets `ending`."""
+    car.ending = DRIVING
     car.reward -= 0.1
     reward = car.reward - car.previous_reward
     car.previous_reward = car.reward
