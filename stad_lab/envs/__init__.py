@@ -1,0 +1,1 @@
+"""The world: CarRacing, its frames and difference images, and the dream."""
