@@ -51,20 +51,23 @@ PLAYFIELD = reference.PLAYFIELD  # half the side of the square field, world unit
 DARKENING = 2  # pygame's smoothscale loses two levels of every channel to its fixed-point sums
 
 # The texture.
-SIZE = 1920  # texels, width and height
-SCALE = SIZE / (2 * PLAYFIELD)  # texels per world unit: 1.9 texels to a pixel of the observation
-PERIOD = SIZE // 20  # texels from one grass square to the next
+FIELD = 1920  # texels, width and height of the field
 CELL = 16  # texels: the texture is restored and shrunk in cells of this size
+RIM = CELL  # texels of black around the field
+SIZE = FIELD + 2 * RIM  # texels, width and height of the texture
+SCALE = FIELD / (2 * PLAYFIELD)  # texels per world unit: 1.9 texels to a pixel of the observation
+ORIGIN = SIZE / 2  # x and y of the world's origin, texels
+PERIOD = FIELD // 20  # texels from one grass square to the next
 CELLS = SIZE // CELL
 SHARP = 2.6  # a pixel that covers more texels than this (in x) needs more samples or a smaller copy
 
 # A texel: the kind of ground in bits 0 to 4, the flags in bits 6 and 7. Roads have three shades,
 # told apart by bits 0 and 1, which count as one kind when edges are looked for.
-BACKGROUND, GRASS, ROAD, WHITE, RED = 0, 4, 8, 12, 16
+BACKGROUND, GRASS, ROAD, WHITE, RED, OUTSIDE = 0, 4, 8, 12, 16, 20
 KIND, KIND_AND_SHADE = 0b11100, 0b11111
 EDGE = 0x80  # the 2 x 2 texels from here to the right and up are of more than one kind
 NEAR = 0x40  # the 4 x 4 texels around those are
-KINDS = 7  # number of colours: background, grass, three shades of road, white, red
+COLORS = 8  # number of colours: background, grass, three shades of road, white, red, outside
 ROAD_SHADES = 3
 
 # Colours with 16 bits for each channel in one 64-bit number: one multiplication weighs all three.
@@ -77,7 +80,10 @@ ONE = 1 << FRACTION
 # The car: the hull's origin lies at the corner between these pixels of the observation.
 HULL_ROW, HULL_COLUMN = 72, 48
 QUARTER_ROWS, QUARTER_COLUMNS = 6, 4  # pixels, size of a quarter of the car
-FINE = 8  # a quarter is drawn so many times larger, then averaged down
+PIXEL_W, PIXEL_H = WINDOW_W / OBSERVATION_SIZE, WINDOW_H / OBSERVATION_SIZE  # window pixels
+CANVAS_ROWS = math.ceil(QUARTER_ROWS * PIXEL_H)  # a quarter is drawn in window pixels, then averaged
+TINY = 1e-6
+CANVAS_COLUMNS = math.ceil(QUARTER_COLUMNS * PIXEL_W)
 TURN_STEPS, MAX_TURN = 24, 12  # a wheel's angle to the hull: steps of 1/24 rad, at most 12 of them
 PHASE_STEPS = 32  # a wheel's rotation: steps of 2 pi / 32
 HULL_POLYGONS = tuple(
@@ -113,7 +119,8 @@ class Ground(NamedTuple):
         texels: uint8 (cars, SIZE, SIZE), kinds and flags.
         quarter, eighth, sixteenth: uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours
             (red in the lowest byte).
-        colors: uint8 (cars, KINDS, 3), of background, grass, three shades of road, white, red.
+        colors: uint8 (cars, COLORS, 3), of background, grass, three shades of road, white, red,
+            outside of the field.
         palette: uint64 (cars, 32), the colour of each kind and shade in 16-bit lanes.
         touched: bool (cars, CELLS, CELLS), the cells that a road polygon may have changed.
         pattern: uint8 (PERIOD, PERIOD), texels of background and grass without a road.
@@ -130,40 +137,39 @@ class Ground(NamedTuple):
 
 
 def make_ground(cars: int) -> Ground:
-    """Memory for the grounds of so many cars, 4.9 MB each; `paint` fills it."""
+    """Memory for the grounds of so many cars, 5 MB each; `paint` adds colours and tracks."""
+    field = empty_field()
+    first = RIM + PERIOD
     return Ground(
-        texels=np.empty((cars, SIZE, SIZE), np.uint8),
-        quarter=np.empty((cars, SIZE // 4, SIZE // 4), np.uint32),
-        eighth=np.empty((cars, SIZE // 8, SIZE // 8), np.uint32),
-        sixteenth=np.empty((cars, SIZE // 16, SIZE // 16), np.uint32),
-        colors=np.zeros((cars, KINDS, 3), np.uint8),
+        texels=np.repeat(field[None], cars, axis=0),
+        quarter=np.zeros((cars, SIZE // 4, SIZE // 4), np.uint32),
+        eighth=np.zeros((cars, SIZE // 8, SIZE // 8), np.uint32),
+        sixteenth=np.zeros((cars, SIZE // 16, SIZE // 16), np.uint32),
+        colors=np.zeros((cars, COLORS, 3), np.uint8),
         palette=np.zeros((cars, 32), np.uint64),
-        touched=np.ones((cars, CELLS, CELLS), np.bool_),
-        pattern=ground_pattern(),
+        touched=np.zeros((cars, CELLS, CELLS), np.bool_),
+        pattern=field[first : first + PERIOD, first : first + PERIOD].copy(),
     )
 
 
-@functools.cache
-def ground_pattern() -> np.ndarray:
-    """Background and grass with their flags over one period, uint8 (PERIOD, PERIOD)."""
-    kinds = np.full((PERIOD, PERIOD), BACKGROUND, np.uint8)
-    kinds[: PERIOD // 2, : PERIOD // 2] = GRASS
-    shifts = [(dy, dx) for dy in range(-1, 3) for dx in range(-1, 3)]
-    other = {shift: np.roll(kinds, np.negative(shift), (0, 1)) != kinds for shift in shifts}
-    near = np.any([other[shift] for shift in shifts], axis=0)
-    edge = np.any([other[shift] for shift in shifts if min(shift) >= 0 and max(shift) <= 1], axis=0)
-    return kinds | np.where(edge, EDGE, 0).astype(np.uint8) | np.where(near, NEAR, 0).astype(np.uint8)
+def empty_field() -> np.ndarray:
+    """Texels of the field without a track, uint8 (SIZE, SIZE)."""
+    pattern = np.full((PERIOD, PERIOD), BACKGROUND, np.uint8)
+    pattern[: PERIOD // 2, : PERIOD // 2] = GRASS
+    texels = np.pad(np.tile(pattern, (20, 20)), RIM, constant_values=OUTSIDE)
+    mark_edges(texels, np.ones((CELLS, CELLS), np.bool_))
+    return texels
 
 
 def ground_colors(background: np.ndarray, grass: np.ndarray, road: np.ndarray) -> np.ndarray:
-    """The colours of an episode, uint8 (KINDS, 3), as Gymnasium's picture shows them.
+    """The colours of an episode, uint8 (COLORS, 3), as Gymnasium's picture shows them.
 
     Args:
         background, grass, road: (3,) each, 0 to 255: Gymnasium's `bg_color`, `grass_color` and
             `road_color`.
     """
     shades = [np.asarray(road) + 0.01 * shade * 255 for shade in range(ROAD_SHADES)]
-    colors = [background, grass, *shades, (255, 255, 255), (255, 0, 0)]
+    colors = [background, grass, *shades, (255, 255, 255), (255, 0, 0), (0, 0, 0)]
     return np.array([[max(0, int(c) - DARKENING) for c in color] for color in colors], np.uint8)
 
 
@@ -178,7 +184,7 @@ def paint(ground, car, road, kinds, colors):
         ground: the Ground to paint on, at index `car`.
         road: float64 (n, 4, 2), polygons in world units, in the order in which they are drawn.
         kinds: uint8 (n,), ROAD + i % 3 for tile i of the track, WHITE or RED for a kerb.
-        colors: uint8 (KINDS, 3), from `ground_colors`.
+        colors: uint8 (COLORS, 3), from `ground_colors`.
     """
     texels, touched = ground.texels[car], ground.touched[car]
     if (colors != ground.colors[car]).any():
@@ -189,7 +195,7 @@ def paint(ground, car, road, kinds, colors):
     changed = touched.copy()
     touched[:] = False
     for number in range(len(road)):
-        corners = (road[number] + PLAYFIELD) * SCALE
+        corners = road[number] * SCALE + ORIGIN
         fill_polygon(texels, corners, kinds[number])
         touch(touched, corners)
     mark_edges(texels, touched)
@@ -199,13 +205,13 @@ def paint(ground, car, road, kinds, colors):
 
 @compiled
 def set_palette(palette, colors):
-    """Spread the colours, uint8 (KINDS, 3), to the lanes of a palette, uint64 (32,)."""
+    """Spread the colours, uint8 (COLORS, 3), to the lanes of a palette, uint64 (32,)."""
     for texel in range(32):
         kind, shade = texel >> 2, min(texel & 3, ROAD_SHADES - 1)
         if kind == ROAD >> 2:
             kind += shade
         elif kind > ROAD >> 2:
-            kind = min(kind + ROAD_SHADES - 1, KINDS - 1)
+            kind = min(kind + ROAD_SHADES - 1, COLORS - 1)
         value = np.uint64(0)
         for channel in range(3):
             value |= np.uint64(colors[kind, channel]) << np.uint64(16 * channel)
@@ -218,9 +224,9 @@ def restore(texels, touched, pattern):
     for i in range(CELLS):
         for j in range(CELLS):
             if touched[i, j]:
-                column = j * CELL % PERIOD
+                column = (j * CELL - RIM) % PERIOD
                 for row in range(i * CELL, i * CELL + CELL):
-                    line = pattern[row % PERIOD]
+                    line = pattern[(row - RIM) % PERIOD]
                     texels[row, j * CELL : j * CELL + CELL] = line[column : column + CELL]
 
 
@@ -276,7 +282,7 @@ def visit(ground, car, tile):
         tile: float64 (4, 2), its corners in world units.
     """
     texels = ground.texels[car]
-    corners = (tile + PLAYFIELD) * SCALE
+    corners = tile * SCALE + ORIGIN
     first_row, end_row = row_range(corners, SIZE)
     for row in range(first_row, end_row):
         first, end = column_range(corners, row, SIZE)
@@ -404,8 +410,8 @@ def look(out, ground, car, pose, zoom, pixel, corner):
     shrunk = 1 if covered < 2 * SHARP else 4 if covered < 4 * SHARP else 8 if covered < 8 * SHARP else 16
     scale = SCALE / shrunk
     cos, sin = math.cos(angle) * scale, math.sin(angle) * scale
-    start_x = (x + PLAYFIELD) * scale + cos * right - sin * up
-    start_y = (y + PLAYFIELD) * scale + sin * right + cos * up
+    start_x = x * scale + ORIGIN / shrunk + cos * right - sin * up
+    start_y = y * scale + ORIGIN / shrunk + sin * right + cos * up
     # Texels are numbered by their centres, hence - 0.5; 1/32 rounds the weights of the interpolation.
     start = to_fixed(start_x - 0.5 + 1 / 32), to_fixed(start_y - 0.5 + 1 / 32)
     across = to_fixed(cos * step_x), to_fixed(sin * step_x)  # from one column to the next
@@ -515,7 +521,7 @@ def write_colors(out, line, shades, first, end):
 
 @compiled
 def shade_tuple(colors):
-    """The colours, uint8 (KINDS, 3), as nested tuples, which a compiler may keep in registers."""
+    """The colours, uint8 (COLORS, 3), as nested tuples, which a compiler may keep in registers."""
     return (
         (colors[0, 0], colors[0, 1], colors[0, 2]),
         (colors[1, 0], colors[1, 1], colors[1, 2]),
@@ -524,6 +530,7 @@ def shade_tuple(colors):
         (colors[4, 0], colors[4, 1], colors[4, 2]),
         (colors[5, 0], colors[5, 1], colors[5, 2]),
         (colors[6, 0], colors[6, 1], colors[6, 2]),
+        (colors[7, 0], colors[7, 1], colors[7, 2]),
     )
 
 
@@ -543,6 +550,8 @@ def color_of(texel, shades):
         color = shades[5]
     if texel == RED:
         color = shades[6]
+    if texel == OUTSIDE:
+        color = shades[7]
     return color
 
 
@@ -659,57 +668,83 @@ def draw_quarter(quarter, place, turn, phase, zoom):
         phase: its rotation in 1/32 of a turn.
         zoom: window pixels per world unit.
     """
-    canvas = np.zeros((QUARTER_ROWS * FINE, QUARTER_COLUMNS * FINE), np.uint8)
-    corner = canvas.shape[1] * (place % 2 == 0), canvas.shape[0] * (place < 2)
-    scale = FINE * OBSERVATION_SIZE * zoom / WINDOW_W, -FINE * OBSERVATION_SIZE * zoom / WINDOW_H
+    canvas = np.zeros((CANVAS_ROWS, CANVAS_COLUMNS), np.uint8)
+    # The column and row of the canvas where the hull's origin lies.
+    corner = CANVAS_COLUMNS * (place % 2 == 0), CANVAS_ROWS * (place < 2)
     cos, sin = math.cos(turn / TURN_STEPS), math.sin(turn / TURN_STEPS)
     low, high = wheel_stripe((phase + 0.5) * math.tau / PHASE_STEPS)
     rectangle = np.empty((4, 2))
     for shape, bottom, top in ((TYRE, -1.0, 1.0), (STRIPE, low, high)):
-        for i in range(4):
-            x = WHEEL_HALF_WIDTH if 0 < i < 3 else -WHEEL_HALF_WIDTH
-            y = WHEEL_RADIUS * (top if i < 2 else bottom)
-            rectangle[i, 0] = (cos * x - sin * y + WHEEL_PLACES[place, 0]) * scale[0] + corner[0]
-            rectangle[i, 1] = (sin * x + cos * y + WHEEL_PLACES[place, 1]) * scale[1] + corner[1]
-        fill_polygon(canvas, rectangle, shape)
+        if bottom <= top:
+            for i in range(4):
+                x = WHEEL_HALF_WIDTH if 0 < i < 3 else -WHEEL_HALF_WIDTH
+                y = WHEEL_RADIUS * (top if i < 2 else bottom)
+                rectangle[i, 0] = cos * x - sin * y + WHEEL_PLACES[place, 0]
+                rectangle[i, 1] = sin * x + cos * y + WHEEL_PLACES[place, 1]
+            fill_shape(canvas, rectangle, shape, zoom, corner)
     for polygon in HULL_POLYGONS:
-        corners = polygon.copy()
-        for i in range(len(corners)):
-            corners[i, 0] = corners[i, 0] * scale[0] + corner[0]
-            corners[i, 1] = corners[i, 1] * scale[1] + corner[1]
-        fill_polygon(canvas, corners, HULL)
-    average_quarter(quarter, canvas)
+        fill_shape(canvas, polygon, HULL, zoom, corner)
+    average_quarter(quarter, canvas, corner)
 
 
 @compiled
-def average_quarter(quarter, canvas):
-    """Average the shapes on a canvas, uint8 (48, 32), to a picture, uint8 (6, 4, 4)."""
+def fill_shape(canvas, polygon, shape, zoom, corner):
+    """Fill a part of the car as pygame does: its corners are whole pixels, its edges belong to it.
+
+    Args:
+        canvas: uint8 (CANVAS_ROWS, CANVAS_COLUMNS), a quarter of the car in window pixels.
+        polygon: float64 (n, 2), world units from the hull's origin.
+        shape: TYRE, STRIPE or HULL.
+        zoom: window pixels per world unit.
+        corner: column and row of the canvas where the hull's origin lies.
+    """
+    corners = np.empty(polygon.shape)
+    middle_x, middle_y = polygon[:, 0].mean(), polygon[:, 1].mean()
+    for i in range(len(polygon)):
+        x, y = polygon[i, 0], polygon[i, 1]
+        # To the pixel's centre, and a little outward, so that `fill_polygon` takes that pixel.
+        corners[i, 0] = corner[0] + math.floor(x * zoom) + 0.5 + (TINY if x > middle_x else -TINY)
+        corners[i, 1] = corner[1] - math.floor(y * zoom) - 0.5 - (TINY if y > middle_y else -TINY)
+    fill_polygon(canvas, corners, shape)
+
+
+@compiled
+def average_quarter(quarter, canvas, corner):
+    """Average the shapes on a canvas to a picture, uint8 (6, 4, 4)."""
+    # The edge of the canvas is the edge of the picture where the hull's origin lies.
+    shift_x = CANVAS_COLUMNS - QUARTER_COLUMNS * PIXEL_W if corner[0] else 0.0
+    shift_y = CANVAS_ROWS - QUARTER_ROWS * PIXEL_H if corner[1] else 0.0
+    area = np.empty(4)
     for row in range(QUARTER_ROWS):
+        top, bottom = row * PIXEL_H + shift_y, (row + 1) * PIXEL_H + shift_y
         for column in range(QUARTER_COLUMNS):
-            count = np.zeros(4, np.int64)
-            for y in range(row * FINE, row * FINE + FINE):
-                for x in range(column * FINE, column * FINE + FINE):
-                    count[canvas[y, x]] += 1
+            left, right = column * PIXEL_W + shift_x, (column + 1) * PIXEL_W + shift_x
+            area[:] = 0
+            for y in range(int(top), min(CANVAS_ROWS, math.ceil(bottom))):
+                height = min(bottom, y + 1.0) - max(top, float(y))
+                for x in range(int(left), min(CANVAS_COLUMNS, math.ceil(right))):
+                    area[canvas[y, x]] += height * (min(right, x + 1.0) - max(left, float(x)))
+            area /= PIXEL_W * PIXEL_H
             for channel in range(3):
-                total = FINE * FINE // 2  # rounds
+                level = 0.5  # rounds
                 for shape in range(4):
-                    total += count[shape] * CAR_COLORS[shape, channel]
-                quarter[row, column, channel] = total // (FINE * FINE)
-            quarter[row, column, 3] = (FINE * FINE - count[0]) * 255 // (FINE * FINE)
+                    level += area[shape] * CAR_COLORS[shape, channel]
+                quarter[row, column, channel] = int(level)
+            quarter[row, column, 3] = int((1 - area[0]) * 255 + 0.5)
 
 
 @compiled
 def wheel_stripe(phase):
-    """The light stripe on a turning wheel, from where to where in wheel radii (equal: not seen)."""
+    """The light stripe on a turning wheel: its ends along the wheel, in radii; (1, -1) if hidden."""
     sin1, sin2 = math.sin(phase), math.sin(phase + 1.2)
     cos1, cos2 = math.cos(phase), math.cos(phase + 1.2)
     if sin1 > 0 and sin2 > 0:
-        return 0.0, 0.0
+        return 1.0, -1.0
     if sin1 > 0:
         cos1 = math.copysign(1.0, cos1)
     if sin2 > 0:
         cos2 = math.copysign(1.0, cos2)
-    return cos2, cos1
+    return min(cos1, cos2), max(cos1, cos2)
 
 
 @compiled
