@@ -98,8 +98,8 @@ HULL_POLYGONS = tuple(
 FULL_ZOOM = reference.ZOOM * reference.SCALE  # window pixels per world unit after the first second
 CAR_TOP, CAR_BOTTOM = HULL_ROW - QUARTER_ROWS, HULL_ROW + QUARTER_ROWS
 CAR_LEFT, CAR_RIGHT = HULL_COLUMN - QUARTER_COLUMNS, HULL_COLUMN + QUARTER_COLUMNS
-PATCH_CORNER = CAR_TOP - 1, CAR_LEFT - 1  # the part of the observation that frames need exactly
-PATCH_ROWS, PATCH_COLUMNS = 2 * QUARTER_ROWS + 2, 2 * QUARTER_COLUMNS + 2
+PATCH_CORNER = CAR_TOP - 1, CAR_LEFT - 2  # the part of the observation that frames need exactly
+PATCH_ROWS, PATCH_COLUMNS = 2 * QUARTER_ROWS + 2, 2 * QUARTER_COLUMNS + 4  # multiples of 8 pixels
 WHEEL_PLACES = np.array(car_dynamics.WHEELPOS) * car_dynamics.SIZE  # world units
 WHEEL_HALF_WIDTH = car_dynamics.WHEEL_W * car_dynamics.SIZE
 WHEEL_RADIUS = car_dynamics.WHEEL_R * car_dynamics.SIZE
@@ -187,12 +187,12 @@ def paint(ground, car, road, kinds, colors):
         colors: uint8 (COLORS, 3), from `ground_colors`.
     """
     texels, touched = ground.texels[car], ground.touched[car]
-    if (colors != ground.colors[car]).any():
-        touched[:] = True  # the smaller copies hold colours: all of them are new
-        ground.colors[car] = colors
-        set_palette(ground.palette[car], colors)
     restore(texels, touched, ground.pattern)
     changed = touched.copy()
+    if (colors != ground.colors[car]).any():
+        changed[:] = True  # the smaller copies hold colours: all of them are new
+        ground.colors[car] = colors
+        set_palette(ground.palette[car], colors)
     touched[:] = False
     for number in range(len(road)):
         corners = road[number] * SCALE + ORIGIN
@@ -447,76 +447,90 @@ def columns_inside(start, step, columns, size):
 
 
 @compiled
-def clip_row(out, x, y, across, size, margin):
-    """Columns of a row, uint8 (columns, 3), that see the field; the others become black.
+def columns_on_texture(x, y, across, columns, size, margin):
+    """First and end of the columns of a row that see a texture, `margin` texels from its borders.
 
     Args:
-        x, y: fixed-point position of the first column.
-        size: of the texture; positions stay within it, `margin` texels from its borders.
+        x, y: fixed-point position of column 0; `across`: the steps from one column to the next.
+        columns: of the row; `size`: of the texture, texels.
     """
-    columns, low = len(out), margin * ONE
-    first_x, end_x = columns_inside(x - low, across[0], columns, size - 1 - 2 * margin)
-    first_y, end_y = columns_inside(y - low, across[1], columns, size - 1 - 2 * margin)
-    first, end = max(first_x, first_y), min(end_x, end_y)
-    if first > 0 or end < columns:
-        out[:] = 0
-    return first, end
+    low, inner = margin * ONE, size - 1 - 2 * margin
+    first_x, end_x = columns_inside(x - low, across[0], columns, inner)
+    first_y, end_y = columns_inside(y - low, across[1], columns, inner)
+    first = max(first_x, first_y)
+    return first, max(first, min(end_x, end_y))
 
 
 @compiled
 def warp_texels(out, ground, car, start, across, down, fine):
     """Warp the full-size texture into `out`, uint8 (rows, columns, 3).
 
-    Row by row: read the texel of every pixel, turn kinds into colours (this loop compiles to vector
-    instructions), then interpolate the pixels that are flagged.
-
     Args:
         start: fixed-point x and y on the texture of the first pixel's centre.
         across, down: fixed-point steps to the next column and to the next row.
         fine: whether one interpolation is enough for a flagged pixel; else it takes four.
     """
-    texels, palette = ground.texels[car].reshape(-1), ground.palette[car]
-    shades = shade_tuple(ground.colors[car])
-    margin, flag = (0, np.uint8(EDGE)) if fine else (3, np.uint8(NEAR))
-    eight_flags = np.uint64(flag) * np.uint64(0x0101010101010101)
-    line = np.zeros(OBSERVATION_SIZE, np.uint8)  # the texels of a row
-    eights = line.view(np.uint64)
-    for row in range(out.shape[0]):
+    rows, columns = out.shape[0], out.shape[1]
+    pixels, margin = out.reshape(-1), 0 if fine else 3
+    nearest = np.empty(rows * columns, np.uint8)  # the texel of each pixel
+    for row in range(rows):
         x, y = start[0] + row * down[0], start[1] + row * down[1]
-        first, end = clip_row(out[row], x, y, across, SIZE, margin)
-        read_texels(line, texels, x, y, across, first, end)
-        write_colors(out[row], line, shades, first, end)
-        for eight in range(first >> 3, end + 7 >> 3):
-            if eights[eight] & eight_flags:  # at least one of eight pixels is near an edge
-                for column in range(max(first, 8 * eight), min(end, 8 * eight + 8)):
-                    if line[column] & flag:
-                        here = x + column * across[0], y + column * across[1]
-                        if fine:
-                            color = interpolate(texels, palette, here[0], here[1])
-                        else:
-                            color = interpolate_4(texels, palette, here, across, down)
-                        write(out[row, column], color)
+        first, end = columns_on_texture(x, y, across, columns, SIZE, margin)
+        line = nearest[row * columns : (row + 1) * columns]
+        read_texels(line, ground.texels[car].reshape(-1), x, y, across, first, end)
+    write_colors(pixels, nearest, shade_tuple(ground.colors[car]))
+    smooth_edges(pixels, nearest, ground, car, columns, start, across, down, fine)
 
 
 @compiled
 def read_texels(line, texels, x, y, across, first, end):
-    """Read the texels, uint8 (SIZE * SIZE,), under the columns `first` to `end` of a row."""
+    """Read the texels under the columns of a row; those before `first` and from `end` on are black.
+
+    Args:
+        line: uint8 (columns,), to write.
+        texels: uint8 (SIZE * SIZE,).
+        x, y: fixed-point position of column 0.
+    """
+    line[:first] = OUTSIDE
+    line[end:] = OUTSIDE
     x += first * across[0]
     y += first * across[1]
     for column in range(first, end):
-        line[column] = texels[np.uint64((y >> FRACTION) * SIZE + (x >> FRACTION))]
+        line[np.uint64(column)] = texels[np.uint64((y >> FRACTION) * SIZE + (x >> FRACTION))]
         x += across[0]
         y += across[1]
 
 
 @compiled
-def write_colors(out, line, shades, first, end):
-    """Turn the texels of a row into colours, uint8 (columns, 3)."""
-    for column in range(first, end):
-        color = color_of(line[column] & KIND_AND_SHADE, shades)
-        out[column, 0] = color[0]
-        out[column, 1] = color[1]
-        out[column, 2] = color[2]
+def write_colors(pixels, nearest, shades):
+    """Turn texels, uint8 (n,), into colours, uint8 (3 n,): red, green, blue, red, ..."""
+    for i in range(len(nearest)):
+        color = color_of(np.uint8(nearest[i] & KIND_AND_SHADE), shades)
+        place = np.uint64(3 * i)
+        pixels[place] = color[0]
+        pixels[place + np.uint64(1)] = color[1]
+        pixels[place + np.uint64(2)] = color[2]
+
+
+@compiled
+def smooth_edges(pixels, nearest, ground, car, columns, start, across, down, fine):
+    """Interpolate the pixels whose texels are flagged; arguments as in `warp_texels`."""
+    texels, palette = ground.texels[car].reshape(-1), ground.palette[car]
+    flag = np.uint8(EDGE if fine else NEAR)
+    eights = nearest.view(np.uint64)
+    eight_flags = np.uint64(flag) * np.uint64(0x0101010101010101)
+    for eight in range(len(eights)):
+        if eights[eight] & eight_flags:  # at least one of eight pixels is near an edge
+            for i in range(8 * eight, 8 * eight + 8):
+                if nearest[i] & flag:
+                    row, column = i // columns, i % columns
+                    x = start[0] + row * down[0] + column * across[0]
+                    y = start[1] + row * down[1] + column * across[1]
+                    if fine:
+                        color = interpolate(texels, palette, x, y)
+                    else:
+                        color = interpolate_4(texels, palette, x, y, across, down)
+                    write(pixels, 3 * i, color)
 
 
 @compiled
@@ -575,26 +589,31 @@ def interpolate(texels, palette, x, y):
 
 
 @compiled
-def interpolate_4(texels, palette, here, across, down):
+def interpolate_4(texels, palette, x, y, across, down):
     """Mean of four interpolations, a quarter of a pixel from its centre to either side."""
     total = np.uint64(0)
     for i in (-1, 1):
         for j in (-1, 1):
-            x = here[0] + ((i * across[0] + j * down[0]) >> 2)
-            y = here[1] + ((i * across[1] + j * down[1]) >> 2)
-            total += (interpolate(texels, palette, x, y) >> np.uint64(2)) & FOURTHS
+            shift_x = (i * across[0] + j * down[0]) >> 2
+            shift_y = (i * across[1] + j * down[1]) >> 2
+            color = interpolate(texels, palette, x + shift_x, y + shift_y)
+            total += (color >> np.uint64(2)) & FOURTHS
     return total
 
 
 @compiled
 def warp_colors(out, colors, start, across, down):
     """Warp a smaller copy of the texture, uint32 (n, n), with interpolation at every pixel."""
-    for row in range(out.shape[0]):
+    rows, columns = out.shape[0], out.shape[1]
+    pixels, size = out.reshape(-1), len(colors)
+    pixels[:] = 0
+    for row in range(rows):
         x, y = start[0] + row * down[0], start[1] + row * down[1]
-        first, end = clip_row(out[row], x, y, across, len(colors), 0)
+        first, end = columns_on_texture(x, y, across, columns, size, 0)
         for column in range(first, end):
             here = x + column * across[0], y + column * across[1]
-            write(out[row, column], interpolate_colors(colors, here[0], here[1]))
+            color = interpolate_colors(colors, here[0], here[1])
+            write(pixels, 3 * (row * columns + column), color)
 
 
 @compiled
@@ -610,11 +629,11 @@ def interpolate_colors(colors, x, y):
 
 
 @compiled
-def write(pixel, color):
-    """Write 256 times a colour, in 16-bit lanes, to a pixel, uint8 (3,)."""
-    pixel[0] = (color >> np.uint64(8)) & np.uint64(255)
-    pixel[1] = (color >> np.uint64(24)) & np.uint64(255)
-    pixel[2] = (color >> np.uint64(40)) & np.uint64(255)
+def write(pixels, place, color):
+    """Write 256 times a colour, in 16-bit lanes, to three bytes from `place` on."""
+    pixels[place] = (color >> np.uint64(8)) & np.uint64(255)
+    pixels[place + 1] = (color >> np.uint64(24)) & np.uint64(255)
+    pixels[place + 2] = (color >> np.uint64(40)) & np.uint64(255)
 
 
 # The car
