@@ -98,13 +98,13 @@ HULL_POLYGONS = tuple(
 FULL_ZOOM = reference.ZOOM * reference.SCALE  # window pixels per world unit after the first second
 CAR_TOP, CAR_BOTTOM = HULL_ROW - QUARTER_ROWS, HULL_ROW + QUARTER_ROWS
 CAR_LEFT, CAR_RIGHT = HULL_COLUMN - QUARTER_COLUMNS, HULL_COLUMN + QUARTER_COLUMNS
-PATCH_CORNER = CAR_TOP - 1, CAR_LEFT - 2  # the part of the observation that frames need exactly
-PATCH_ROWS, PATCH_COLUMNS = 2 * QUARTER_ROWS + 2, 2 * QUARTER_COLUMNS + 4  # multiples of 8 pixels
+PATCH_CORNER = CAR_TOP - 1, CAR_LEFT - 4  # the part of the observation that frames need exactly
+PATCH_ROWS, PATCH_COLUMNS = 2 * QUARTER_ROWS + 2, 16
 WHEEL_PLACES = np.array(car_dynamics.WHEELPOS) * car_dynamics.SIZE  # world units
 WHEEL_HALF_WIDTH = car_dynamics.WHEEL_W * car_dynamics.SIZE
 WHEEL_RADIUS = car_dynamics.WHEEL_R * car_dynamics.SIZE
 TYRE, STRIPE, HULL = 1, 2, 3
-CAR_COLORS = np.array([(0, 0, 0), (0, 0, 0), (75, 75, 75), (202, 0, 0)], np.int64)  # darkened
+CAR_COLORS = np.array([(0, 0, 0), (0, 0, 0), (75, 75, 75), (202, 0, 0)], np.float64)  # darkened
 
 # The indicator bar.
 SCORE_COLUMNS = 12  # pixels of the observation that the score may cover
@@ -121,7 +121,7 @@ class Ground(NamedTuple):
             (red in the lowest byte).
         colors: uint8 (cars, COLORS, 3), of background, grass, three shades of road, white, red,
             outside of the field.
-        palette: uint64 (cars, 32), the colour of each kind and shade in 16-bit lanes.
+        palette: uint64 (cars, 256), the colour of each texel in 16-bit lanes.
         touched: bool (cars, CELLS, CELLS), the cells that a road polygon may have changed.
         pattern: uint8 (PERIOD, PERIOD), texels of background and grass without a road.
     """
@@ -146,7 +146,7 @@ def make_ground(cars: int) -> Ground:
         eighth=np.zeros((cars, SIZE // 8, SIZE // 8), np.uint32),
         sixteenth=np.zeros((cars, SIZE // 16, SIZE // 16), np.uint32),
         colors=np.zeros((cars, COLORS, 3), np.uint8),
-        palette=np.zeros((cars, 32), np.uint64),
+        palette=np.zeros((cars, 256), np.uint64),
         touched=np.zeros((cars, CELLS, CELLS), np.bool_),
         pattern=field[first : first + PERIOD, first : first + PERIOD].copy(),
     )
@@ -205,9 +205,9 @@ def paint(ground, car, road, kinds, colors):
 
 @compiled
 def set_palette(palette, colors):
-    """Spread the colours, uint8 (COLORS, 3), to the lanes of a palette, uint64 (32,)."""
-    for texel in range(32):
-        kind, shade = texel >> 2, min(texel & 3, ROAD_SHADES - 1)
+    """Spread the colours, uint8 (COLORS, 3), to the lanes of a palette, uint64 (256,)."""
+    for texel in range(256):
+        kind, shade = (texel & KIND) >> 2, min(texel & 3, ROAD_SHADES - 1)
         if kind == ROAD >> 2:
             kind += shade
         elif kind > ROAD >> 2:
@@ -349,11 +349,11 @@ def shrink(ground, car, changed):
 def average_16(texels, palette, row, column):
     """Mean colour of 4 x 4 texels, uint32."""
     if not texels[row + 1, column + 1] & NEAR:  # all of one kind
-        return to_bytes(palette[texels[row, column] & KIND_AND_SHADE])
+        return to_bytes(palette[texels[row, column]])
     total = np.uint64(0)
     for y in range(row, row + 4):
         for x in range(column, column + 4):
-            total += palette[texels[y, x] & KIND_AND_SHADE]
+            total += palette[texels[y, x]]
     return to_bytes((total >> np.uint64(4)) & LANES)
 
 
@@ -513,24 +513,43 @@ def write_colors(pixels, nearest, shades):
 
 
 @compiled
+def find_flagged(found, nearest, columns, flag):
+    """List the pixels whose texel has a flag, as row * 2**16 + column; returns how many.
+
+    Most pixels have none, so we look at eight at a time, as one 64-bit number. Where there is one,
+    every pixel of the eight is written to the list, but the list grows by the flagged ones only:
+    there is no jump for a processor to predict wrongly.
+
+    Args:
+        found: int64 (pixels + 8,), to write.
+        nearest: uint8 (pixels,), texels row by row, `columns` in a row (a multiple of 8).
+    """
+    eights, count = nearest.view(np.uint64), 0
+    eight_flags = np.uint64(flag) * np.uint64(0x0101010101010101)
+    for row in range(len(nearest) // columns):
+        for column in range(0, columns, 8):
+            first = row * columns + column
+            if eights[first >> 3] & eight_flags:
+                for i in range(8):
+                    found[count] = (row << 16) + column + i
+                    count += (nearest[first + i] & flag) != 0
+    return count
+
+
+@compiled
 def smooth_edges(pixels, nearest, ground, car, columns, start, across, down, fine):
     """Interpolate the pixels whose texels are flagged; arguments as in `warp_texels`."""
     texels, palette = ground.texels[car].reshape(-1), ground.palette[car]
-    flag = np.uint8(EDGE if fine else NEAR)
-    eights = nearest.view(np.uint64)
-    eight_flags = np.uint64(flag) * np.uint64(0x0101010101010101)
-    for eight in range(len(eights)):
-        if eights[eight] & eight_flags:  # at least one of eight pixels is near an edge
-            for i in range(8 * eight, 8 * eight + 8):
-                if nearest[i] & flag:
-                    row, column = i // columns, i % columns
-                    x = start[0] + row * down[0] + column * across[0]
-                    y = start[1] + row * down[1] + column * across[1]
-                    if fine:
-                        color = interpolate(texels, palette, x, y)
-                    else:
-                        color = interpolate_4(texels, palette, x, y, across, down)
-                    write(pixels, 3 * i, color)
+    found = np.empty(len(nearest) + 8, np.int64)
+    for i in range(find_flagged(found, nearest, columns, EDGE if fine else NEAR)):
+        row, column = found[i] >> 16, found[i] & 0xFFFF
+        x = start[0] + row * down[0] + column * across[0]
+        y = start[1] + row * down[1] + column * across[1]
+        if fine:
+            color = interpolate(texels, palette, x, y)
+        else:
+            color = interpolate_4(texels, palette, x, y, across, down)
+        write(pixels, 3 * (row * columns + column), color)
 
 
 @compiled
@@ -582,9 +601,9 @@ def interpolate(texels, palette, x, y):
     left, down = np.uint64(16) - right, np.uint64(16) - up
     here = np.uint64((y >> FRACTION) * SIZE + (x >> FRACTION))
     above = here + np.uint64(SIZE)
-    one, mask = np.uint64(1), np.uint64(KIND_AND_SHADE)
-    lower = palette[texels[here] & mask] * left + palette[texels[here + one] & mask] * right
-    upper = palette[texels[above] & mask] * left + palette[texels[above + one] & mask] * right
+    one = np.uint64(1)
+    lower = palette[texels[here]] * left + palette[texels[here + one]] * right
+    upper = palette[texels[above]] * left + palette[texels[above + one]] * right
     return lower * down + upper * up + HALF
 
 
@@ -733,23 +752,24 @@ def average_quarter(quarter, canvas, corner):
     # The edge of the canvas is the edge of the picture where the hull's origin lies.
     shift_x = CANVAS_COLUMNS - QUARTER_COLUMNS * PIXEL_W if corner[0] else 0.0
     shift_y = CANVAS_ROWS - QUARTER_ROWS * PIXEL_H if corner[1] else 0.0
-    area = np.empty(4)
     for row in range(QUARTER_ROWS):
         top, bottom = row * PIXEL_H + shift_y, (row + 1) * PIXEL_H + shift_y
         for column in range(QUARTER_COLUMNS):
             left, right = column * PIXEL_W + shift_x, (column + 1) * PIXEL_W + shift_x
-            area[:] = 0
+            covered, red, green = 0.0, 0.5, 0.5  # 0.5 rounds; blue is equal to green
             for y in range(int(top), min(CANVAS_ROWS, math.ceil(bottom))):
-                height = min(bottom, y + 1.0) - max(top, float(y))
+                height = (min(bottom, y + 1.0) - max(top, float(y))) / (PIXEL_W * PIXEL_H)
                 for x in range(int(left), min(CANVAS_COLUMNS, math.ceil(right))):
-                    area[canvas[y, x]] += height * (min(right, x + 1.0) - max(left, float(x)))
-            area /= PIXEL_W * PIXEL_H
-            for channel in range(3):
-                level = 0.5  # rounds
-                for shape in range(4):
-                    level += area[shape] * CAR_COLORS[shape, channel]
-                quarter[row, column, channel] = int(level)
-            quarter[row, column, 3] = int((1 - area[0]) * 255 + 0.5)
+                    shape = canvas[y, x]
+                    if shape:
+                        area = height * (min(right, x + 1.0) - max(left, float(x)))
+                        covered += area
+                        red += area * CAR_COLORS[shape, 0]
+                        green += area * CAR_COLORS[shape, 1]
+            quarter[row, column, 0] = int(red)
+            quarter[row, column, 1] = int(green)
+            quarter[row, column, 2] = int(green)
+            quarter[row, column, 3] = int(255 * covered + 0.5)
 
 
 @compiled
