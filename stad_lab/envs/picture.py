@@ -226,8 +226,9 @@ def restore(texels, touched, pattern):
             if touched[i, j]:
                 column = (j * CELL - RIM) % PERIOD
                 for row in range(i * CELL, i * CELL + CELL):
-                    line = pattern[(row - RIM) % PERIOD]
-                    texels[row, j * CELL : j * CELL + CELL] = line[column : column + CELL]
+                    line = (row - RIM) % PERIOD
+                    for k in range(CELL):
+                        texels[row, j * CELL + k] = pattern[line, column + k]
 
 
 @compiled
@@ -294,38 +295,55 @@ def visit(ground, car, tile):
 
 @compiled
 def mark_edges(texels, touched):
-    """Set the flags EDGE and NEAR in the touched cells."""
-    around = np.empty(SIZE, np.uint8)
+    """Set the flags EDGE and NEAR in the touched cells and between them."""
+    around = np.zeros(SIZE, np.uint8)
     for i in range(CELLS):
-        for j in range(CELLS):
-            if touched[i, j]:
-                end = min(j * CELL + CELL, SIZE - 1)
-                for row in range(i * CELL, min(i * CELL + CELL, SIZE - 1)):
-                    mark_edge_row(texels[row], texels[row + 1], j * CELL, end)
+        first, end = touched_columns(touched[i])
+        for row in range(i * CELL, min(i * CELL + CELL, SIZE - 1) if first < end else 0):
+            mark_edge_row(texels[row, first : end + 1], texels[row + 1, first : end + 1])
     for i in range(CELLS):
-        for j in range(CELLS):
-            if touched[i, j]:
-                first, end = max(1, j * CELL), min(j * CELL + CELL, SIZE - 1)
-                for row in range(max(1, i * CELL), min(i * CELL + CELL, SIZE - 1)):
-                    mark_near_row(texels[row - 1], texels[row], texels[row + 1], first, end, around)
+        first, end = touched_columns(touched[i])
+        for row in range(max(1, i * CELL), min(i * CELL + CELL, SIZE - 1) if first < end else 0):
+            rows = texels[row - 1 : row + 2, first : end + 1]
+            mark_near_row(rows[0], rows[1], rows[2], around)
 
 
 @compiled
-def mark_edge_row(line, above, first, end):
-    """EDGE: do the four texels from here to the right and up differ in kind?"""
-    for x in range(first, end):
+def touched_columns(touched):
+    """First texel and end of the touched cells in a row of cells, bool (CELLS,)."""
+    first, end = SIZE, 0
+    for j in range(CELLS):
+        if touched[j]:
+            first, end = min(first, j * CELL), j * CELL + CELL
+    return first, min(end, SIZE - 1)
+
+
+@compiled
+def mark_edge_row(line, above):
+    """EDGE: do the four texels from here to the right and up differ in kind?
+
+    Args:
+        line: uint8 (n + 1,), of which the first n are marked; `above`: the same of the next row.
+    """
+    for x in range(len(line) - 1):
         here = line[x]
         different = (here ^ line[x + 1]) | (here ^ above[x]) | (here ^ above[x + 1])
-        line[x] = (here & KIND_AND_SHADE) | (EDGE if different & KIND else 0)
+        flag = np.uint8(EDGE) if np.uint8(different & KIND) else np.uint8(0)
+        line[x] = (here & ~EDGE) | flag
 
 
 @compiled
-def mark_near_row(below, line, above, first, end, around):
-    """NEAR: is there an EDGE among the 3 x 3 texels around this one?"""
-    for x in range(first - 1, end + 1):
+def mark_near_row(below, line, above, around):
+    """NEAR: is there an EDGE among the 3 x 3 texels around this one?
+
+    Args:
+        below, line, above: uint8 (n + 1,), three rows, of which the middle one is marked.
+        around: uint8 (at least n + 1,), to work with.
+    """
+    for x in range(len(line)):
         around[x] = (below[x] | line[x] | above[x]) & EDGE
-    for x in range(first, end):
-        line[x] |= (around[x - 1] | around[x] | around[x + 1]) >> 1
+    for x in range(1, len(line) - 1):
+        line[x] |= np.uint8(around[x - 1] | around[x] | around[x + 1]) >> 1
 
 
 @compiled
