@@ -73,7 +73,7 @@ ROAD_SHADES = 3
 # Colours with 16 bits for each channel in one 64-bit number: one multiplication weighs all three.
 LANES = np.uint64(0x00FF00FF00FF)
 HALF = np.uint64(0x008000800080)  # rounds a sum of weights 256 to the nearest level
-FOURTHS = np.uint64(0x3FFF3FFF3FFF)
+HALVES = np.uint64(0x7FFF7FFF7FFF)  # the lanes of a colour that has been halved
 FRACTION = 16  # positions on the texture are fixed-point numbers with so many binary digits
 ONE = 1 << FRACTION
 
@@ -486,7 +486,7 @@ def warp_texels(out, ground, car, start, across, down, fine):
     Args:
         start: fixed-point x and y on the texture of the first pixel's centre.
         across, down: fixed-point steps to the next column and to the next row.
-        fine: whether one interpolation is enough for a flagged pixel; else it takes four.
+        fine: whether one interpolation is enough for a flagged pixel; else it takes two.
     """
     rows, columns = out.shape[0], out.shape[1]
     pixels, margin = out.reshape(-1), 0 if fine else 3
@@ -531,26 +531,24 @@ def write_colors(pixels, nearest, shades):
 
 
 @compiled
-def find_flagged(found, nearest, columns, flag):
-    """List the pixels whose texel has a flag, as row * 2**16 + column; returns how many.
+def find_flagged(found, nearest, flag):
+    """List the pixels whose texel has a flag; returns how many there are.
 
-    Most pixels have none, so we look at eight at a time, as one 64-bit number. Where there is one,
-    every pixel of the eight is written to the list, but the list grows by the flagged ones only:
-    there is no jump for a processor to predict wrongly.
+    Most have none, so we look at eight at a time, as one 64-bit number. Where there is one, every
+    pixel of the eight is written to the list, but the list grows by the flagged ones only: so there
+    is no jump for a processor to predict wrongly.
 
     Args:
-        found: int64 (pixels + 8,), to write.
-        nearest: uint8 (pixels,), texels row by row, `columns` in a row (a multiple of 8).
+        found: uint16 (n + 8,), to write.
+        nearest: uint8 (n,), the texels; n is a multiple of 8.
     """
-    eights, count = nearest.view(np.uint64), 0
+    eights, count = nearest.view(np.uint64), np.uint64(0)
     eight_flags = np.uint64(flag) * np.uint64(0x0101010101010101)
-    for row in range(len(nearest) // columns):
-        for column in range(0, columns, 8):
-            first = row * columns + column
-            if eights[first >> 3] & eight_flags:
-                for i in range(8):
-                    found[count] = (row << 16) + column + i
-                    count += (nearest[first + i] & flag) != 0
+    for eight in range(len(eights)):
+        if eights[eight] & eight_flags:
+            for i in range(8 * eight, 8 * eight + 8):
+                found[count] = i
+                count += np.uint64((nearest[np.uint64(i)] & flag) != 0)
     return count
 
 
@@ -558,16 +556,18 @@ def find_flagged(found, nearest, columns, flag):
 def smooth_edges(pixels, nearest, ground, car, columns, start, across, down, fine):
     """Interpolate the pixels whose texels are flagged; arguments as in `warp_texels`."""
     texels, palette = ground.texels[car].reshape(-1), ground.palette[car]
-    found = np.empty(len(nearest) + 8, np.int64)
-    for i in range(find_flagged(found, nearest, columns, EDGE if fine else NEAR)):
-        row, column = found[i] >> 16, found[i] & 0xFFFF
+    found = np.empty(len(nearest) + 8, np.uint16)
+    for i in range(find_flagged(found, nearest, EDGE if fine else NEAR)):
+        pixel = np.uint32(found[i])
+        row = np.int64(np.uint32(pixel // np.uint32(columns)))
+        column = np.int64(pixel) - row * columns
         x = start[0] + row * down[0] + column * across[0]
         y = start[1] + row * down[1] + column * across[1]
         if fine:
             color = interpolate(texels, palette, x, y)
         else:
-            color = interpolate_4(texels, palette, x, y, across, down)
-        write(pixels, 3 * (row * columns + column), color)
+            color = interpolate_2(texels, palette, x, y, across)
+        write(pixels, np.uint64(3) * np.uint64(pixel), color)
 
 
 @compiled
@@ -626,16 +626,12 @@ def interpolate(texels, palette, x, y):
 
 
 @compiled
-def interpolate_4(texels, palette, x, y, across, down):
-    """Mean of four interpolations, a quarter of a pixel from its centre to either side."""
-    total = np.uint64(0)
-    for i in (-1, 1):
-        for j in (-1, 1):
-            shift_x = (i * across[0] + j * down[0]) >> 2
-            shift_y = (i * across[1] + j * down[1]) >> 2
-            color = interpolate(texels, palette, x + shift_x, y + shift_y)
-            total += (color >> np.uint64(2)) & FOURTHS
-    return total
+def interpolate_2(texels, palette, x, y, across):
+    """Mean of two interpolations, a quarter of a pixel to the left and to the right."""
+    shift_x, shift_y = across[0] >> 2, across[1] >> 2
+    left = interpolate(texels, palette, x - shift_x, y - shift_y)
+    right = interpolate(texels, palette, x + shift_x, y + shift_y)
+    return ((left >> np.uint64(1)) & HALVES) + ((right >> np.uint64(1)) & HALVES)
 
 
 @compiled
@@ -650,7 +646,7 @@ def warp_colors(out, colors, start, across, down):
         for column in range(first, end):
             here = x + column * across[0], y + column * across[1]
             color = interpolate_colors(colors, here[0], here[1])
-            write(pixels, 3 * (row * columns + column), color)
+            write(pixels, np.uint64(3 * (row * columns + column)), color)
 
 
 @compiled
@@ -669,8 +665,8 @@ def interpolate_colors(colors, x, y):
 def write(pixels, place, color):
     """Write 256 times a colour, in 16-bit lanes, to three bytes from `place` on."""
     pixels[place] = (color >> np.uint64(8)) & np.uint64(255)
-    pixels[place + 1] = (color >> np.uint64(24)) & np.uint64(255)
-    pixels[place + 2] = (color >> np.uint64(40)) & np.uint64(255)
+    pixels[place + np.uint64(1)] = (color >> np.uint64(24)) & np.uint64(255)
+    pixels[place + np.uint64(2)] = (color >> np.uint64(40)) & np.uint64(255)
 
 
 # The car
