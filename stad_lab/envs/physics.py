@@ -670,7 +670,7 @@ def solve_velocities(car, state, saved, joints, pushes):
             changed |= bits[k] ^ saved_bits[k]
         if changed == 0:
             break
-        if age >= max(2, done // 2):
+        if age >= max(2, done // 8):
             for k in range(STATE_SIZE):
                 saved_bits[k] = bits[k]
             age = 0

@@ -44,6 +44,7 @@ from gymnasium.envs.box2d import car_racing as reference
 from numba import njit
 
 compiled = njit(cache=True, nogil=True, error_model="numpy")
+merged = njit(cache=True, nogil=True, error_model="numpy", inline="always")  # into its one caller
 
 # The pictures, and Gymnasium's window, whose coordinates we share.
 OBSERVATION_SIZE = 96  # pixels, width and height of the observation
@@ -281,7 +282,7 @@ def visit(ground, car, tile):
     to_texels(corners, tile)
     _, _, low, high = bounds(corners)
     for row in range(max(0, math.ceil(low - 0.5)), min(SIZE, math.ceil(high - 0.5))):
-        first, end = column_range(corners, row, SIZE)
+        first, end = column_range(corners, row, texels.shape[1])
         for column in range(first, end):
             if texels[row, column] & KIND == ROAD:  # leave the kerbs of the neighbours
                 texels[row, column] &= EDGE | NEAR | KIND
@@ -302,12 +303,13 @@ def mark_edges(texels, cells):
     for i in range(CELLS):
         first, end = road_columns(cells[i])
         for row in range(i * CELL, min(i * CELL + CELL, SIZE - 1) if first < end else 0):
-            mark_edge_row(texels[row], texels[row + 1], first, end)
+            mark_edge_row(texels[row, first : end + 1], texels[row + 1, first : end + 1])
     around = np.zeros(SIZE, np.uint8)
     for i in range(CELLS):
         first, end = road_columns(cells[i])
         for row in range(max(1, i * CELL), min(i * CELL + CELL, SIZE - 1) if first < end else 0):
-            mark_near_row(texels[row - 1], texels[row], texels[row + 1], first, end, around)
+            three = texels[row - 1 : row + 2, max(first - 1, 0) : end + 1]
+            mark_near_row(three[0], three[1], three[2], around)
 
 
 @compiled
@@ -321,14 +323,14 @@ def road_columns(cells):
 
 
 @compiled
-def mark_edge_row(line, above, first, end):
+def mark_edge_row(line, above):
     """EDGE: do the four texels from here to the right and up differ in kind?
 
     Args:
-        line, above: uint8 (SIZE,), the row to mark and the next one.
-        first, end: the columns to mark.
+        line, above: uint8 (n + 1,), a part of the row to mark, all but its last texel, and of the
+            next row. Indices from 0 let the compiler use vector instructions.
     """
-    for x in range(first, end):
+    for x in range(len(line) - 1):
         here = line[x]
         different = (here ^ line[x + 1]) | (here ^ above[x]) | (here ^ above[x + 1])
         flag = np.uint8(EDGE) if np.uint8(different & KIND) else np.uint8(0)
@@ -336,18 +338,17 @@ def mark_edge_row(line, above, first, end):
 
 
 @compiled
-def mark_near_row(below, line, above, first, end, around):
+def mark_near_row(below, line, above, around):
     """NEAR: is there an EDGE among the 3 x 3 texels around this one?
 
     Args:
-        below, line, above: uint8 (SIZE,), three rows, of which the middle one is marked.
-        first, end: the columns to mark, but not the first of all.
-        around: uint8 (SIZE,), to work with.
+        below, line, above: uint8 (n + 2,), parts of three rows; the middle one is marked, all but
+            its first and its last texel.
+        around: uint8 (n + 2 or more,), to work with.
     """
-    first = max(1, first)
-    for x in range(first - 1, end + 1):
+    for x in range(len(line)):
         around[x] = (below[x] | line[x] | above[x]) & EDGE
-    for x in range(first, end):
+    for x in range(1, len(line) - 1):
         line[x] |= np.uint8(around[x - 1] | around[x] | around[x + 1]) >> 1
 
 
@@ -482,13 +483,17 @@ def columns_inside(start, step, columns, size):
 
 
 @compiled
-def columns_on_texture(x, y, across, columns, size, margin):
-    """First and end of the columns of a row that see a texture, `margin` texels from its borders.
+def columns_on_texture(x, y, across, columns, size):
+    """First and end of the columns of a row that see a texture; the others see black.
+
+    The texture has a black rim, so we may keep away from its borders, where an interpolation would
+    need texels beyond them.
 
     Args:
         x, y: fixed-point position of column 0; `across`: the steps from one column to the next.
         columns: of the row; `size`: of the texture, texels.
     """
+    margin = 4 * size // SIZE
     low, inner = margin * ONE, size - 1 - 2 * margin
     first_x, end_x = columns_inside(x - low, across[0], columns, inner)
     first_y, end_y = columns_inside(y - low, across[1], columns, inner)
@@ -496,7 +501,7 @@ def columns_on_texture(x, y, across, columns, size, margin):
     return first, max(first, min(end_x, end_y))
 
 
-@compiled
+@merged
 def warp_texels(out, ground, car, start, across, down, fine):
     """Warp the full-size texture into `out`, uint8 (rows, columns, 3).
 
@@ -508,11 +513,10 @@ def warp_texels(out, ground, car, start, across, down, fine):
     rows, columns = out.shape[0], out.shape[1]
     pixels, texels = out.reshape(-1), ground.texels[car].reshape(-1)
     palette = ground.palette[car]
-    margin = RIM // 4  # keeps the interpolation on the texture
     nearest = np.empty(rows * columns, np.uint8)  # the texel of each pixel
     for row in range(rows):
         x, y = start[0] + row * down[0], start[1] + row * down[1]
-        first, end = columns_on_texture(x, y, across, columns, SIZE, margin)
+        first, end = columns_on_texture(x, y, across, columns, ground.texels.shape[1])
         line = nearest[row * columns : (row + 1) * columns]
         read_texels(line, texels, x, y, across, first, end)
     write_colors(pixels, nearest, palette)
@@ -598,7 +602,7 @@ def find_flagged(found, nearest, flag):
     return count
 
 
-@compiled
+@merged
 def smooth_edges(pixels, nearest, texels, palette, columns, start, across, down, fine):
     """Interpolate the pixels whose texels are flagged.
 
@@ -651,7 +655,7 @@ def warp_colors(out, colors, start, across, down):
     pixels, size = out.reshape(-1), len(colors)
     for row in range(rows):
         x, y = start[0] + row * down[0], start[1] + row * down[1]
-        first, end = columns_on_texture(x, y, across, columns, size, 0)
+        first, end = columns_on_texture(x, y, across, columns, size)
         for column in range(columns):
             color = np.uint64(0)
             if first <= column < end:
@@ -764,7 +768,7 @@ def wheel_stripe(phase):
     return min(cos1, cos2), max(cos1, cos2)
 
 
-@compiled
+@merged
 def to_window(polygon, zoom, origin):
     """Turn world units into window pixels, in place, so that it is filled as pygame fills it.
 
@@ -784,7 +788,7 @@ def to_window(polygon, zoom, origin):
         polygon[i, 1] = origin[1] - math.floor(polygon[i, 1] * zoom) - 0.5 - out_y
 
 
-@compiled
+@merged
 def average_quarter(quarter, canvas, origin):
     """Average the shapes on a canvas of window pixels to a picture, uint8 (6, 4, 4)."""
     # The side of the canvas where the hull's origin lies is the side of the picture, too.
@@ -919,7 +923,7 @@ def draw_rectangle(out, x1, x2, y1, y2, red, green, blue):
 # Whole pictures
 
 
-@compiled
+@merged
 def draw_picture(out, ground, pictures, car, hull, wheels, reward, time, bar):
     """Draw the observation or the agent's frame of one car.
 
@@ -1008,7 +1012,8 @@ def _make_pictures() -> Pictures:
     halves = score.repeat(2, axis=1).repeat(2, axis=2)  # three of them make a pixel of the frame
     small = halves.reshape(len(score), 8, 3, 8, 3).mean(axis=(2, 4)).round().astype(np.uint8)
     car = np.empty((4, 2 * MAX_TURN + 1, PHASE_STEPS, QUARTER_ROWS, QUARTER_COLUMNS, 4), np.uint8)
-    draw_quarters(car)
+    for place, turn, phase in np.ndindex(car.shape[:3]):
+        draw_quarter(car[place, turn, phase], place, turn - MAX_TURN, phase, ZOOM)
     return Pictures(car, np.ascontiguousarray(score), np.ascontiguousarray(small))
 
 
@@ -1020,11 +1025,3 @@ def score_picture(font: pygame.font.Font, text: str) -> np.ndarray:
     small = pygame.transform.smoothscale(surface, (SCORE_COLUMNS, BAR_ROWS))
     return pygame.surfarray.array3d(small)[:, :, 0].T
 
-
-@compiled
-def draw_quarters(car):
-    """Draw all quarters of the car in full zoom into the table `car` of Pictures."""
-    for place in range(4):
-        for turn in range(-MAX_TURN, MAX_TURN + 1):
-            for phase in range(PHASE_STEPS):
-                draw_quarter(car[place, turn + MAX_TURN, phase], place, turn, phase, ZOOM)
