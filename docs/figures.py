@@ -6,20 +6,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 CONDITIONS = {
-    "paper": "Paper's recipe, indicator bar cropped",
-    "no_bar": "Our recipe, one iteration, indicator bar cropped",
-    "two_iterations": "Our recipe, two iterations, indicator bar visible",
-    "fine_tuned": "The same with fine-tuning",
+    "paper": "A. Paper's recipe, indicator bar cropped",
+    "no_bar": "B. Our recipe, one iteration, indicator bar cropped",
+    "two_iterations": "C. Our recipe, two iterations, indicator bar visible",
+    "fine_tuned": "D. C with fine-tuning",
 }
 COLOURS = {"frame": "#555555", "input": "#0072B2", "output": "#D55E00", "input_output": "#009E73"}
 PAPER_LEAD = 75  # of `input_output`, the smallest of the three that the paper reports
 
 
-def plot_forest(differences: dict[str, dict[str, dict]], best_episode: float) -> Figure:
+def plot_forest(recipes: dict[str, dict[str, dict]], best_episode: float) -> Figure:
     """For each condition and variant: the runs less the mean of `frame`, and the 95% interval.
 
     Args:
-        differences: condition -> variant -> "mean", "runs" and, but for `frame`, "difference" and
+        recipes: condition -> variant -> "mean", "runs" and, but for `frame`, "difference" and
             "interval", in points.
         best_episode: the highest return of any episode; a mean cannot lie above it.
     """
@@ -27,15 +27,15 @@ def plot_forest(differences: dict[str, dict[str, dict]], best_episode: float) ->
     axes = figure.subplots(len(CONDITIONS), 1)
     described = []
     for axis, (condition, title) in zip(axes, CONDITIONS.items(), strict=True):
-        found = differences[condition]
+        found = recipes[condition]
         base = found["frame"]["mean"]
         axis.set_title(f"{title} (frame: {base:.0f} points)", loc="left", fontsize=10)
         plot_condition(axis, found)
-        others = [describe(variant, found[variant]) for variant in found if variant != "frame"]
+        others = [describe(variant, found[variant]) for variant in COLOURS if variant != "frame"]
         described += [f"{title}, frame {base:.0f}: " + ", ".join(others) + "."]
     share_limits(axes[1:])
     for axis, condition in zip(axes, CONDITIONS, strict=True):
-        shade_from(axis, best_episode - differences[condition]["frame"]["mean"])
+        shade_from(axis, best_episode - recipes[condition]["frame"]["mean"])
     axes[-1].set_xlabel("Difference of the mean return to frame, points")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.set_label(
@@ -85,7 +85,12 @@ def shade_from(axis: Axes, start: float) -> None:
 def describe(variant: str, one: dict) -> str:
     """A variant's difference in words, for the alternative text."""
     low, high = one["interval"]
-    return f"{variant} {one['difference']:+.0f} ({low:.0f} to {high:.0f})"
+    return f"{variant} {signed(one['difference'])} ({low:.0f} to {high:.0f})"
+
+
+def signed(number: float) -> str:
+    """A rounded number with its sign, and 0 without."""
+    return f"{round(number):+d}" if round(number) else "0"
 
 
 def to_png(figure: Figure) -> bytes:
