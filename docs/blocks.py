@@ -3,8 +3,10 @@
 import ast
 import inspect
 import itertools
+import json
 import re
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from figures import CONDITIONS, plot_forest, signed
 from gallery import CELLS, PICTURES
@@ -12,6 +14,8 @@ from PIL import Image
 
 from stad_lab import config
 
+PRETRAINED = Path(config.__file__).parent / "pretrained"
+AGENTS = (*config.VARIANTS, "cropped_input")
 QUANTITIES = (
     "forward speed", "slip speed", "yaw rate", "wheel angle", "road offset", "heading error",
 )  # fmt: skip
@@ -80,14 +84,14 @@ def trainings(claims: dict, variant: str) -> list[str]:
     return [one for one in names if re.fullmatch(rf"(cropped|no_bar|paper)_{variant}-\d+", one)]
 
 
-def representation_table(claims: dict) -> str:
+def representation_table(claims: dict, quantities: tuple[str, ...] = QUANTITIES) -> str:
     """The range of R2 from z over the trainings of each variant, while the agent drives."""
     lines = []
     for variant in config.VARIANTS:
         found = [r2(claims, "agent", one) for one in trainings(claims, variant)]
-        ranges = [spread([one[quantity] for one in found]) for quantity in QUANTITIES]
+        ranges = [spread([one[quantity] for one in found]) for quantity in quantities]
         lines.append((f"`{variant}`", str(len(found)), *ranges))
-    return table(("variant", "trainings", *QUANTITIES), lines)
+    return table(("variant", "trainings", *quantities), lines)
 
 
 def spread(values: list[float]) -> str:
@@ -125,7 +129,8 @@ def agents_table(claims: dict) -> str:
     """The shipped agents, one line each."""
     head = ("agent", "mean", "minimum", "10th percentile", "below 800", "Gymnasium")
     lines = []
-    for name, one in claims["agents"].items():
+    for name in AGENTS:
+        one = claims["agents"][name]
         scores = [f"{one[key]:.1f}" for key in ("mean", "minimum", "tenth_percentile")]
         card = f"[`{name}`](stad_lab/pretrained/{name}/README.md)"
         lines.append((card, *scores, f"{one['below_800']:.0%}", one["gymnasium"]))
@@ -148,6 +153,31 @@ def card(claims: dict, name: str) -> str:
          f" {one['frames'] / 1e6:.1f} million frames"),
     ]  # fmt: skip
     return table(("measure", "value"), lines)
+
+
+def recipe(name: str) -> str:
+    """The stages of a shipped agent's training, from its record."""
+    record, lines = json.loads((PRETRAINED / name / "record.json").read_text("utf-8")), []
+    while record:
+        one = record["config"]["evolution"]
+        driven = record["budget"]["evolution"]["episodes"]
+        numbers = [str(one[key]) for key in ("generations", "population", "tracks")]
+        numbers += [f"{one['replay_share']:.0%}", str(one["sigma"]), f"{driven:,}"]
+        lines.insert(0, numbers)
+        record = record.get("earlier")
+    stages = ("first iteration", "second iteration", "fine-tuning")
+    head = ("stage", "generations", "candidates", "tracks", "replayed", "sigma", "episodes")
+    return table(head, [(stage, *one) for stage, one in zip(stages, lines, strict=False)])
+
+
+def probe_card(claims: dict, name: str) -> str:
+    """R2 of the probe for one V and M, with both drivers."""
+    lines = []
+    for driver, title in (("agent", "trained agent"), ("random_driver", "random driver")):
+        for features in ("z", "z, h"):
+            found = r2(claims, driver, f"{name}-0", features)
+            lines.append((title, features, *(f"{found[one]:.2f}" for one in QUANTITIES)))
+    return table(("driver", "features", *QUANTITIES), lines)
 
 
 # Speed
@@ -238,6 +268,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "agents": agents_table,
     "results": results_table,
     "representation": representation_table,
+    "representation of turning": lambda claims: representation_table(claims, QUANTITIES[1:4]),
     "latents, agent": lambda claims: latents_table(claims, "agent"),
     "latents, random driver": lambda claims: latents_table(claims, "random_driver"),
     "experiments": experiments_table,
@@ -256,8 +287,13 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "gallery": gallery,
     "figure": lambda claims: f"![{forest(claims).get_label()}](notebooks/pictures/claims.png)",
     "figure in docs": lambda claims: BLOCKS["figure"](claims).replace("(note", "(../note"),
-} | {f"card {name}": lambda claims, name=name: card(claims, name)
-     for name in (*config.VARIANTS, "cropped_input")}  # fmt: skip
+}
+BLOCKS |= {f"card {name}": lambda claims, name=name: card(claims, name) for name in AGENTS}
+BLOCKS |= {f"recipe {name}": lambda claims, name=name: recipe(name) for name in AGENTS}
+BLOCKS |= {
+    f"probe {name}": lambda claims, name=name: probe_card(claims, name)
+    for name in ("cropped_frame", "cropped_output", "cropped_input_output")
+}
 
 
 def our_means(claims: dict) -> list[float]:

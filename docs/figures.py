@@ -6,10 +6,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 CONDITIONS = {
-    "paper": "A. Paper's recipe, indicator bar cropped",
-    "no_bar": "B. Our recipe, one iteration, indicator bar cropped",
-    "two_iterations": "C. Our recipe, two iterations, indicator bar visible",
-    "fine_tuned": "D. C with fine-tuning",
+    "paper": "1. Paper's recipe, indicator bar cropped",
+    "no_bar": "2. One iteration, indicator bar cropped",
+    "two_iterations": "3. Two iterations, indicator bar visible",
+    "fine_tuned": "4. As 3 with fine-tuning",
 }
 COLOURS = {"frame": "#555555", "input": "#0072B2", "output": "#D55E00", "input_output": "#009E73"}
 PAPER_LEAD = 75  # of `input_output`, the smallest of the three that the paper reports
@@ -32,15 +32,15 @@ def plot_forest(recipes: dict[str, dict[str, dict]], best_episode: float) -> Fig
         axis.set_title(f"{title} (frame: {base:.0f} points)", loc="left", fontsize=10)
         plot_condition(axis, found)
         others = [describe(variant, found[variant]) for variant in COLOURS if variant != "frame"]
-        described += [f"{title}, frame {base:.0f}: " + ", ".join(others) + "."]
+        described += [f"{title.split(',')[0]}, frame {base:.0f}: " + ", ".join(others) + "."]
     share_limits(axes[1:])
     for axis, condition in zip(axes, CONDITIONS, strict=True):
         shade_from(axis, best_episode - recipes[condition]["frame"]["mean"])
     axes[-1].set_xlabel("Difference of the mean return to frame, points")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
     figure.set_label(
-        "Do difference images help? Mean return on 100 tracks less that of frame, with 95%"
-        " intervals. The paper reports +75. " + " ".join(described)
+        "Mean return less that of frame, with 95% intervals; the paper reports"
+        f" +{PAPER_LEAD}. " + " ".join(described)
     )
     return figure
 
