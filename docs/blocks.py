@@ -14,7 +14,12 @@ from PIL import Image
 
 from stad_lab import config
 
-PRETRAINED = Path(config.__file__).parent / "pretrained"
+PACKAGE = Path(config.__file__).parent
+PRETRAINED = PACKAGE / "pretrained"
+LAYERS = (
+    "checks", "doctor", "config", "envs", "models", "io", "agent", "training", "evaluation", "viz",
+    "play", "replication", "benchmark", "cli",
+)  # fmt: skip
 AGENTS = (*config.VARIANTS, "cropped_input")
 QUANTITIES = (
     "forward speed", "slip speed", "yaw rate", "wheel angle", "road offset", "heading error",
@@ -25,6 +30,11 @@ def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
     """A table in Markdown."""
     head = list(head)
     return "\n".join("| " + " | ".join(one) + " |" for one in [head, ["---"] * len(head), *lines])
+
+
+def fixed(value: float) -> str:
+    """Two decimals, and no negative zero."""
+    return f"{round(value, 2) + 0.0:.2f}"
 
 
 # The replication
@@ -112,7 +122,9 @@ def probe_line(claims: dict, driver: str, world_model: str, title: str) -> tuple
     """One line of `latents_table`."""
     alone = r2(claims, driver, f"{world_model}-0")
     both = r2(claims, driver, f"{world_model}-0", "z, h")
-    cells = [f"{alone[one]:.2f}" + (f" ({both[one]:.2f})" if both else "") for one in QUANTITIES]
+    cells = [
+        f"{fixed(alone[one])}" + (f" ({fixed(both[one])})" if both else "") for one in QUANTITIES
+    ]
     return (title, *cells)
 
 
@@ -176,7 +188,7 @@ def probe_card(claims: dict, name: str) -> str:
     for driver, title in (("agent", "trained agent"), ("random_driver", "random driver")):
         for features in ("z", "z, h"):
             found = r2(claims, driver, f"{name}-0", features)
-            lines.append((title, features, *(f"{found[one]:.2f}" for one in QUANTITIES)))
+            lines.append((title, features, *(f"{fixed(found[one])}" for one in QUANTITIES)))
     return table(("driver", "features", *QUANTITIES), lines)
 
 
@@ -251,6 +263,25 @@ def help_of(kind: type) -> dict[str, str]:
     }
 
 
+def modules_list(claims: dict) -> str:
+    """The directive that makes a page for each module, in the order of the layers."""
+    lines = ["```{eval-rst}", ".. autosummary::", "   :toctree: modules", ""]
+    return "\n".join([*lines, *(f"   {name}" for name in modules()), "```"])
+
+
+def modules() -> list[str]:
+    """All modules of the library, lower layers first."""
+    files = [file.relative_to(PACKAGE).with_suffix("") for file in PACKAGE.rglob("*.py")]
+    names = [".".join(file.parts) for file in files if not file.name.startswith("__")]
+    return [f"stad_lab.{name}" for name in sorted(names, key=lambda name: (layer(name), name))]
+
+
+def layer(name: str) -> int:
+    """The place of a module in LAYERS; the last for one that is not listed."""
+    top = name.split(".")[0]
+    return LAYERS.index(top) if top in LAYERS else len(LAYERS)
+
+
 def gallery(claims: dict) -> str:
     """Some figures of the notebooks, with the alternative texts that their files hold."""
     files = [PICTURES / f"{cell}.png" for cell in CELLS]
@@ -284,6 +315,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     ),
     "projection": projection_table,
     "settings": settings_table,
+    "modules": modules_list,
     "gallery": gallery,
     "figure": lambda claims: f"![{forest(claims).get_label()}](notebooks/pictures/claims.png)",
     "figure in docs": lambda claims: BLOCKS["figure"](claims).replace("(note", "(../note"),
