@@ -48,7 +48,7 @@ def results_table(claims: dict) -> str:
         for variant in config.VARIANTS[1:]:
             one = found[variant]
             low, high = one["interval"]
-            difference = f"{signed(one['difference'])} ({low:.0f} to {high:.0f})"
+            difference = f"{signed(one['difference'])} ({round(low)} to {round(high)})"
             means = (f"{found['frame']['mean']:.0f}", f"{one['mean']:.0f}", difference)
             name = f"{title[0]} `{variant}`"
             runs = str(len(one["runs"]))
@@ -67,16 +67,15 @@ def verdict(found: dict) -> str:
 
 def experiments_table(claims: dict) -> str:
     """All earlier runs, without inference."""
-    head = ("experiment", "what", "runs", "V, M", "mean of each run", "mean", "median")
-    head += ("10th percentile", "below 800", "complete laps", "agents", "episodes")
+    head = ("experiment", "what", "V, M", "mean of each run", "mean", "below 800", "complete laps")
+    head += ("candidates", "episodes")
     lines = []
     for name, one in claims["experiments"].items():
-        counts = (str(one["seeds"]), str(one["world_models"]))
         runs = ", ".join(f"{mean:.0f}" for mean in one["runs"])
-        scores = [f"{one[key]:.1f}" for key in ("mean", "median", "tenth_percentile")]
+        scores = (str(one["world_models"]), runs, f"{one['mean']:.1f}")
         shares = [f"{one[key]:.0%}" for key in ("below_800", "above_900")]
         budget = [f"{one[key]:,.0f}" for key in ("agents", "episodes")]
-        lines.append((f"`{name}`", one["about"], *counts, runs, *scores, *shares, *budget))
+        lines.append((f"`{name}`", one["about"], *scores, *shares, *budget))
     return table(head, lines)
 
 
@@ -111,8 +110,8 @@ def spread(values: list[float]) -> str:
 
 def latents_table(claims: dict, driver: str) -> str:
     """R2 from z, and in brackets from z and h, of one training of each variant."""
-    groups = {"cropped_{}": "`{}`", "{}": "`{}`, bar visible"}
-    names = [(group.format(one), told.format(one)) for group, told in groups.items()
+    groups = {"cropped_{}": "`{}`", "{}": "`{}`, indicator bar visible"}
+    names = [(group.format(one), title.format(one)) for group, title in groups.items()
              for one in config.VARIANTS]  # fmt: skip
     names += [(f"untrained_cropped_{one}", f"`{one}`, untrained") for one in config.VARIANTS[::3]]
     return table(("V", *QUANTITIES), [probe_line(claims, driver, *name) for name in names])
@@ -287,7 +286,7 @@ def gallery(claims: dict) -> str:
     files = [PICTURES / f"{cell}.png" for cell in CELLS]
     texts = [Image.open(file).text["Description"].replace("$", "") for file in files]
     pairs = zip(files, texts, strict=True)
-    return "\n\n".join(f"![{text}](../notebooks/pictures/{file.name})" for file, text in pairs)
+    return "\n".join(f"![{text}](../notebooks/pictures/{file.name})" for file, text in pairs)
 
 
 def forest(claims: dict):

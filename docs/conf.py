@@ -2,7 +2,7 @@
 
 The source folder is the repository, so the notebooks are read in place and their links hold here as
 on a code host. Their outputs are cached: only a changed notebook, library or preset runs them
-again. Neither the build nor the finished pages need a network.
+again. Neither the build nor the pages need a network.
 """
 
 import hashlib
@@ -71,7 +71,7 @@ autodoc_typehints_description_target = "documented"
 autodoc_default_options = {"members": True}
 napoleon_numpy_docstring = False
 
-# Looks
+# Appearance
 html_theme = "furo"
 html_title = "stad_lab"
 html_static_path = [str(HERE / "_static")]
@@ -101,7 +101,7 @@ def explain_widgets(app, doctree) -> None:
 
 
 def check_site(app, error) -> None:
-    """Report each fault of the finished site as a warning, which `-W` makes an error."""
+    """Report each fault of the built site as a warning, which `-W` makes an error."""
     if error is None and app.builder.name == "html":
         for fault in faults(Path(app.outdir)):
             logging.getLogger("site_check").warning(fault)

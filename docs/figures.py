@@ -85,7 +85,7 @@ def shade_from(axis: Axes, start: float) -> None:
 def describe(variant: str, one: dict) -> str:
     """A variant's difference in words, for the alternative text."""
     low, high = one["interval"]
-    return f"{variant} {signed(one['difference'])} ({low:.0f} to {high:.0f})"
+    return f"{variant} {signed(one['difference'])} ({round(low)} to {round(high)})"
 
 
 def signed(number: float) -> str:

@@ -16,8 +16,6 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from stad_lab.viz.widgets import show
-
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
 import blocks  # noqa: E402
@@ -128,9 +126,11 @@ def test_the_gallery_has_a_picture_of_each_of_its_cells():
 
 
 def test_the_figure_of_a_cell_is_the_one_that_a_reader_sees(tmp_path, monkeypatch):
+    from stad_lab.viz.widgets import show
+
     figure = Figure(figsize=(1, 1))
     figure.set_label("an empty square")
-    # A kernel that imports PyTorch is slow, so the cell has the finished figure.
+    # A kernel that imports PyTorch is slow, so the cell has a ready figure.
     cell = f"from IPython.display import HTML\nHTML({show(figure).data!r})"
     notebook = json.loads(small_notebook(cell)) | {"nbformat_minor": 5}
     for number, one in enumerate(notebook["cells"]):
