@@ -12,7 +12,7 @@ from figures import CONDITIONS, plot_forest, signed
 from gallery import CELLS, PICTURES
 from PIL import Image
 
-from stad_lab import config
+from stad_lab import cli, config
 
 PACKAGE = Path(config.__file__).parent
 PRETRAINED = PACKAGE / "pretrained"
@@ -238,6 +238,15 @@ def projection_table(claims: dict) -> str:
 # The configuration, and the pictures
 
 
+def commands_table(claims: dict) -> str:
+    """The commands, with the first line of their help."""
+    lines = [
+        (f"`{name}`", (command.__doc__ or "").strip().partition("\n")[0].rstrip("."))
+        for name, command in cli.COMMANDS.items()
+    ]
+    return table(("command", "what it does"), lines)
+
+
 def settings_table(claims: dict) -> str:
     """All settings, with the values of the three presets."""
     values = [
@@ -313,6 +322,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
         claims, "cluster: frames a second, a generation", "workers"
     ),
     "projection": projection_table,
+    "commands": commands_table,
     "settings": settings_table,
     "modules": modules_list,
     "gallery": gallery,
