@@ -29,7 +29,9 @@ QUANTITIES = (
 def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
     """A table in Markdown."""
     head = list(head)
-    return "\n".join("| " + " | ".join(one) + " |" for one in [head, ["---"] * len(head), *lines])
+    cells = [head, ["---"] * len(head), *lines]
+    escaped = ([cell.replace("|", r"\|") for cell in line] for line in cells)
+    return "\n".join("| " + " | ".join(line) + " |" for line in escaped)
 
 
 def fixed(value: float) -> str:
