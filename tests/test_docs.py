@@ -7,6 +7,7 @@ runs one small notebook in their place.
 import io
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+
+from stad_lab.cli import parse
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
@@ -99,6 +102,13 @@ def test_links_resolve_and_no_marker_of_a_number_begins_a_line(name):
     for link in re.findall(r"\]\(([^)#\s]+)", text):
         assert "://" in link or (PAGES[name].parent / link).exists(), link
     assert not re.search(r"^\s*<!-- claims: [^>]+ -->[^\n]", text, re.M)
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_every_command_on_a_page_is_one_that_the_command_line_takes(name):
+    text = PAGES[name].read_text(encoding="utf-8").replace("\\\n", " ")
+    for line in re.findall(r"^python -m stad_lab (.*)$", text, re.M):
+        parse(shlex.split(line, comments=True))
 
 
 @pytest.mark.parametrize("name", ["instructor", "glossary"])
