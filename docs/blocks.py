@@ -63,8 +63,8 @@ def results_table(claims: dict) -> str:
 def verdict(found: dict) -> str:
     """What a condition says about the claim."""
     if not found["baseline_passes"]:
-        return "none: baseline fails"
-    return found["outcome"] if found["has_room"] else "none: ceiling"
+        return "inconclusive: baseline fails"
+    return found["outcome"] if found["has_room"] else "inconclusive: ceiling"
 
 
 def experiments_table(claims: dict) -> str:
