@@ -17,8 +17,8 @@ from stad_lab import cli, config
 PACKAGE = Path(config.__file__).parent
 PRETRAINED = PACKAGE / "pretrained"
 LAYERS = (
-    "checks", "doctor", "config", "envs", "models", "io", "agent", "training", "evaluation", "viz",
-    "play", "replication", "benchmark", "cli",
+    "checks", "doctor", "config", "envs", "models", "io", "agent", "dreaming", "training",
+    "evaluation", "viz", "play", "replication", "benchmark", "cli",
 )  # fmt: skip
 AGENTS = (*config.VARIANTS, "cropped_input")
 QUANTITIES = (
