@@ -1,68 +1,80 @@
-"""A batch of CarRacing episodes without pictures: tracks, random numbers and physics together."""
+"""A batch of CarRacing episodes: tracks, random numbers, physics and pictures together."""
 
-from collections.abc import Iterable, Sequence
+import functools
+from collections.abc import Sequence
 
 import numpy as np
 from gymnasium.utils import seeding
 
-from stad_lab.envs import physics
-from stad_lab.envs.track import Track, make_track
+from stad_lab.envs import physics, picture
+from stad_lab.envs.frames import FRAME_SIZE, OBSERVATION_SIZE
+from stad_lab.envs.track import MAX_TILES, TRACK_WIDTH, Track, make_track
 
 # Steering, gas and brake of Gymnasium's five discrete actions: nothing, right, left, gas, brake.
-# The
-# zeros of the steering are negative, since it is negated: Gymnasium's own come out as +0.
+# Steering is negated, so its zeros are negative: Gymnasium's own come out as +0.
 DISCRETE_ACTIONS = np.array(
     [[-0.0, 0, 0], [0.6, 0, 0], [-0.6, 0, 0], [-0.0, 0.2, 0], [-0.0, 0, 0.8]], np.float64
 )
+SIZES = {"observation": OBSERVATION_SIZE, "frame": FRAME_SIZE}  # of the pictures, pixels
+COLORS = {"road": (102, 102, 102), "background": (102, 204, 102), "grass": (102, 230, 102)}
 
 
 class Cars:
     """`count` independent cars, each on its own track, with the rules of Gymnasium's CarRacing-v3.
 
-    Threads may call `reset` and `step` at once on different cars: nothing is shared between cars,
-    and the compiled code releases the GIL. Ended episodes are not restarted.
+    Threads may work at once on different `Cars`; the compiled code releases the GIL. An episode
+    that has ended is not restarted.
 
     Args:
         count: number of cars.
-        continuous: whether actions are float (n, 3), steering -1 to 1, gas and brake 0 to 1; else
-            they are int (n,), 0 to 4.
-        lap_complete_percent: as in Gymnasium, from 0 to 1. Since the car starts on tile 0, all
-            tiles must be visited to finish a lap, unless this share is that of a few tiles only.
+        shows: what `draw` draws: "observation", uint8 (96, 96, 3), or "frame", the agent's, uint8
+            (64, 64, 3). Memory for the pictures, 5 MB a car, is taken at the first `draw`.
+        bar: whether to draw the indicator bar. Without it the lowest rows of an observation are
+            black, and a frame shows the rest.
+        continuous: whether actions are float (n, 3), steering -1 to 1, gas and brake 0 to 1; or
+            int (n,), 0 to 4.
+        lap_complete_percent: as in Gymnasium, from 0 to 1.
         domain_randomize: whether each episode has its own random colours.
 
     Attributes:
         cars: `physics.CAR` (count,), the state of each car; see there.
-        roads: `physics.ROAD` (count,), the tiles of each car's track, and which are visited.
-        tracks: the track of each car.
+        roads: `physics.ROAD` (count,), the tiles of each track, and which were visited.
+        tracks: the Track of each car.
         randoms: the random generator of each car, Gymnasium's `np_random`.
-        road_colors, background_colors, grass_colors: float64 (count, 3), 0 to 255.
+        colors: "road", "background" and "grass", float64 (count, 3), 0 to 255.
     """
 
     def __init__(
         self,
         count: int,
+        shows: str = "observation",
+        bar: bool = True,
         continuous: bool = True,
         lap_complete_percent: float = 0.95,
         domain_randomize: bool = False,
     ):
-        self.continuous = continuous
-        self.lap_complete_percent = lap_complete_percent
+        self.shows, self.bar, self.continuous = shows, bar, continuous
+        self.lap_complete_percent = float(lap_complete_percent)
         self.domain_randomize = domain_randomize
-        self.cars = np.zeros(count, physics.CAR)
-        self.roads = np.zeros(count, physics.ROAD)
+        self.cars, self.roads = np.zeros(count, physics.CAR), np.zeros(count, physics.ROAD)
         self.tracks: list[Track | None] = [None] * count
         self.randoms = [seeding.np_random()[0] for _ in range(count)]
-        self.road_colors = np.tile([102.0, 102, 102], (count, 1))
-        self.background_colors = np.tile([102.0, 204, 102], (count, 1))
-        self.grass_colors = np.tile([102.0, 230, 102], (count, 1))
-        if domain_randomize:
-            for car in range(count):
-                self._draw_colors(car)
+        self.colors = {
+            name: np.tile(np.array(one, float), (count, 1)) for name, one in COLORS.items()
+        }
+        self._tiles = np.zeros((count, MAX_TILES, 4, 2))
+        self._painted = np.zeros(count, bool)
+        self._ground: picture.Ground | None = None
+        for car in range(count if domain_randomize else 0):
+            self._draw_colors(car)
+
+    def __len__(self) -> int:
+        return len(self.cars)
 
     def reset(
         self,
         seeds: Sequence[int | None] | None = None,
-        which: Iterable[int] | None = None,
+        which: Sequence[int] | None = None,
         randomize: bool = True,
     ) -> None:
         """Begin new episodes.
@@ -70,9 +82,9 @@ class Cars:
         Args:
             seeds: for each of these cars, its seed, or None to go on with its random numbers.
             which: numbers of the cars; all by default.
-            randomize: whether to draw new colours, where `domain_randomize` is set.
+            randomize: whether to draw new colours, with `domain_randomize`.
         """
-        which = list(range(len(self.cars)) if which is None else which)
+        which = range(len(self)) if which is None else which
         seeds = [None] * len(which) if seeds is None else seeds
         for car, seed in zip(which, seeds, strict=True):
             if seed is not None:
@@ -80,49 +92,111 @@ class Cars:
             if self.domain_randomize and randomize:
                 self._draw_colors(car)
             track = self.tracks[car] = make_track(self.randoms[car])
-            physics.start_car(
-                self.cars,
-                self.roads,
-                car,
-                track.path,
-                track.tiles,
-                float(self.lap_complete_percent),
-            )
+            share = self.lap_complete_percent
+            physics.start_car(self.cars, self.roads, car, track.path, track.tiles, share)
+            self._tiles[car, : len(track.tiles)] = track.tiles
+            self._painted[car] = False
 
-    def step(self, actions: np.ndarray, part: slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    def step(
+        self, actions: np.ndarray, which: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Drive cars for one frame of 1/50 second.
 
         Args:
             actions: one for each of these cars, see the class.
-            part: which cars, in steps of one; all by default.
+            which: int64 (n,), numbers of the cars; all by default.
 
         Returns:
-            rewards: float64 (n,).
-            terminated: bool (n,). `cars["ending"]` says whether by a finished lap or off the field.
+            The rewards, float64 (n,), and whether the episodes have ended, bool (n,);
+            `cars["ending"]` says how.
 
         Raises:
             ValueError: an action that is not finite or not one of the five, or a wrong shape.
         """
-        cars, roads = self.cars[part], self.roads[part]
+        which = self._numbers(which)
+        rewards, actions = np.empty(len(which)), self._checked(actions, len(which))
+        physics.step_cars(self.cars, self.roads, which, actions, rewards)
+        return rewards, self.cars["ending"][which] != physics.DRIVING
+
+    def draw(self, which: np.ndarray | None = None) -> np.ndarray:
+        """What cars see, uint8 (n, 96, 96, 3) or (n, 64, 64, 3); `which` as for `step`."""
+        which = self._numbers(which)
+        if self._ground is None:
+            self._ground = picture.make_ground(len(self))
+        for car in which[~self._painted[which]]:
+            self._paint(car)
+        size = SIZES[self.shows]
+        out = np.empty((len(which), size, size, 3), np.uint8)
+        arrays = which, self.cars, self.roads, self._tiles
+        picture.draw_cars(out, self._ground, picture.make_pictures(), *arrays, self.bar)
+        return out
+
+    def place(
+        self, car: int, tile: int, speed: float = 0.0, turn: float = 0.0, offset: float = 0.0
+    ) -> None:
+        """Put a car on a tile of its track, moving, with the opening zoom behind it.
+
+        A random driver sees more than the first bend only so: CarRacing starts at rest on tile 0.
+
+        Args:
+            tile: number of the tile, modulo their count.
+            speed: forward, world units per second (a calm lap has about 40).
+            turn: heading against the road's direction, radians, positive to the left.
+            offset: from the centre line, in half road widths, positive to the right.
+        """
+        path = self.tracks[car].path
+        _, beta, x, y = path[tile % len(path)]
+        x += offset * TRACK_WIDTH * np.cos(beta)
+        y += offset * TRACK_WIDTH * np.sin(beta)
+        physics.place_car(self.cars, car, float(beta + turn), float(x), float(y), float(speed))
+
+    def _numbers(self, which: np.ndarray | None) -> np.ndarray:
+        return np.arange(len(self)) if which is None else np.asarray(which, np.int64)
+
+    def _checked(self, actions: np.ndarray, count: int) -> np.ndarray:
         if self.continuous:
             actions = np.ascontiguousarray(actions, np.float64)
-            if actions.shape != (len(cars), 3) or not np.isfinite(actions).all():
+            if actions.shape != (count, 3) or not np.isfinite(actions).all():
                 raise ValueError(
-                    f"actions of shape {actions.shape}: expected finite numbers ({len(cars)}, 3), "
-                    "steering, gas and brake"
+                    f"actions {actions}: expected finite numbers of shape ({count}, 3), steering,"
+                    " gas and brake"
                 )
-        else:
-            numbers = np.asarray(actions)
-            if numbers.shape != (len(cars),) or not np.isin(numbers, range(5)).all():
-                raise ValueError(f"actions {numbers}: expected {len(cars)} numbers, each 0 to 4")
-            actions = DISCRETE_ACTIONS[numbers.astype(np.int64)]
-        rewards = np.empty(len(cars))
-        physics.step_cars(cars, roads, actions, rewards)
-        return rewards, cars["ending"] != physics.DRIVING
+            return actions
+        numbers = np.asarray(actions)
+        if numbers.shape != (count,) or not np.isin(numbers, range(len(DISCRETE_ACTIONS))).all():
+            raise ValueError(f"actions {numbers}: expected {count} numbers, each 0 to 4")
+        return DISCRETE_ACTIONS[numbers.astype(np.int64)]
+
+    def _paint(self, car: int) -> None:
+        polygons, kinds = road_polygons(self.tracks[car])
+        colors = [self.colors[name][car] for name in ("background", "grass", "road")]
+        picture.paint(self._ground, car, polygons, kinds, picture.ground_colors(*colors))
+        road = self.roads[car : car + 1]["darkened"]
+        road[road == 2] = 1  # what an earlier picture of this episode had painted
+        self._painted[car] = True
 
     def _draw_colors(self, car: int) -> None:
         random = self.randoms[car]
-        self.road_colors[car] = random.uniform(0, 210, size=3)
-        self.background_colors[car] = random.uniform(0, 210, size=3)
-        self.grass_colors[car] = self.background_colors[car]
-        self.grass_colors[car, random.integers(3)] += 20
+        self.colors["road"][car] = random.uniform(0, 210, size=3)
+        self.colors["background"][car] = random.uniform(0, 210, size=3)
+        self.colors["grass"][car] = self.colors["background"][car]
+        self.colors["grass"][car, random.integers(3)] += 20
+
+
+def road_polygons(track: Track) -> tuple[np.ndarray, np.ndarray]:
+    """Tiles and kerbs in the order in which Gymnasium draws them: a kerb follows its tile.
+
+    Returns:
+        Corners, float64 (n, 4, 2), and kinds for `picture.paint`, uint8 (n,).
+    """
+    tiles, kerbs = np.arange(len(track.tiles)), track.kerb_tiles
+    order = np.argsort(np.concatenate([tiles, kerbs + 0.5]))
+    kinds = [picture.ROAD + tiles % picture.ROAD_SHADES]
+    kinds.append(np.where(kerbs % 2, picture.RED, picture.WHITE))
+    polygons = np.concatenate([track.tiles, track.kerbs])[order]
+    return polygons, np.concatenate(kinds)[order].astype(np.uint8)
+
+
+@functools.cache
+def warm_up() -> None:
+    """Compile the engine, or load what was compiled before; says so if it takes long."""

@@ -921,18 +921,19 @@ def make_memory():
 
 
 @njit(cache=True, nogil=True)
-def step_cars(cars, roads, actions, rewards):
-    """Drive each car for one frame. Releases the GIL: threads may step different cars at once.
+def step_cars(cars, roads, which, actions, rewards):
+    """Drive some cars for one frame. Releases the GIL: threads may step different cars at once.
 
     Args:
-        cars: CAR (n,), is changed; `ending` says which episodes are over.
-        roads: ROAD (n,), is changed.
+        cars: CAR (cars,), is changed; `ending` says which episodes are over.
+        roads: ROAD (cars,), is changed.
+        which: int64 (n,), numbers of the cars that drive.
         actions: float64 (n, 3): steering -1 to 1, gas and brake 0 to 1.
         rewards: float64 (n,), is written.
     """
     memory = make_memory()
-    for n in range(len(cars)):
-        car, road = cars[n], roads[n]
+    for n in range(len(which)):
+        car, road = cars[which[n]], roads[which[n]]
         control(car, actions[n, 0], actions[n, 1], actions[n, 2])
         advance(car, road, memory)
         car.frames += 1
@@ -951,7 +952,23 @@ def start_car(cars, roads, n, path, tiles, lap_complete):
     """
     car, road = cars[n], roads[n]
     lay_road(road, tiles)
-    angle, x, y = f32(path[0, 1]), path[0, 2], path[0, 3]
+    put_at_rest(car, path[0, 1], path[0, 2], path[0, 3])
+    car.time = car.reward = car.previous_reward = 0.0
+    car.lap_complete = lap_complete
+    car.tiles_visited = car.frames = car.new_lap = car.ending = 0
+    advance(car, road, make_memory())
+
+
+@njit(cache=True, nogil=True)
+def put_at_rest(car, heading, x, y):
+    """Make a new car at rest. Its wheels are placed as if it faced north, as Gymnasium does.
+
+    Args:
+        car: record, is changed.
+        heading: radians.
+        x, y: of the hull's origin, world units.
+    """
+    angle = f32(heading)
     cosine, sine = math.cos(angle), math.sin(angle)
     for body in range(BODIES):
         px, py = f32(x), f32(y)
@@ -973,10 +990,34 @@ def start_car(cars, roads, n, path, tiles, lap_complete):
         car.push[i, 0] = car.push[i, 1] = car.motor[i] = car.stop[i] = ZERO
         car.at_stop[i], car.on_road[i], car.motor_speed[i] = 0, 0, ZERO
         car.steer[i] = car.gas[i] = car.brake[i] = car.omega[i] = car.phase[i] = 0.0
-    car.time = car.reward = car.previous_reward = 0.0
-    car.lap_complete = lap_complete
-    car.tiles_visited = car.frames = car.new_lap = car.ending = 0
-    advance(car, road, make_memory())
+
+
+@njit(cache=True, nogil=True)
+def place_car(cars, n, heading, x, y, speed):
+    """Replace car n by a new one that moves straight ahead, its wheels rolling.
+
+    Args:
+        cars: CAR (cars,); element n is changed.
+        heading: radians.
+        x, y: of the hull's origin, world units.
+        speed: world units per second.
+    """
+    car = cars[n]
+    put_at_rest(car, heading, x, y)
+    cosine, sine = car.rotation[HULL, 0], car.rotation[HULL, 1]
+    for i in range(WHEELS):
+        lx, ly = f32(WHEEL_OFFSETS[i, 0]), f32(WHEEL_OFFSETS[i, 1])
+        px = (cosine * lx - sine * ly) + car.position[HULL, 0]
+        py = (sine * lx + cosine * ly) + car.position[HULL, 1]
+        cx, cy = CENTERS[1 + i, 0], CENTERS[1 + i, 1]
+        car.position[1 + i, 0], car.position[1 + i, 1] = px, py
+        car.center[1 + i, 0] = (cosine * cx - sine * cy) + px
+        car.center[1 + i, 1] = (sine * cx + cosine * cy) + py
+        car.omega[i] = speed / WHEEL_RADIUS
+    for body in range(BODIES):
+        car.velocity[body, 0] = f32(-math.sin(heading) * speed)
+        car.velocity[body, 1] = f32(math.cos(heading) * speed)
+    car.time = max(car.time, 1.0)  # the opening zoom is over
 
 
 @njit(cache=True, nogil=True)

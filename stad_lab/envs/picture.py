@@ -61,7 +61,9 @@ FIELD = 1920  # texels, width and height of the field
 CELL = 16  # texels: the texture is restored and shrunk in cells of this size
 RIM = CELL  # texels of black around the field
 SIZE = FIELD + 2 * RIM  # texels, width and height of the texture
-SCALE = FIELD / (2 * reference.PLAYFIELD)  # texels per world unit: 1.9 to a pixel of the observation
+SCALE = FIELD / (
+    2 * reference.PLAYFIELD
+)  # texels per world unit: 1.9 to a pixel of the observation
 ORIGIN = SIZE / 2  # x and y of the world's origin, texels
 PERIOD = FIELD // 20  # texels from one grass square to the next
 CELLS = SIZE // CELL
@@ -88,22 +90,27 @@ BLOCK = 16  # pixels that are searched for flags at a time
 # The car. The hull's origin lies at a corner between four pixels of the observation.
 HULL_ROW, HULL_COLUMN = 72, 48
 QUARTER_ROWS, QUARTER_COLUMNS = 6, 4  # pixels, size of a quarter of the car
-CANVAS_ROWS = math.ceil(QUARTER_ROWS * PIXEL_H)  # a quarter is drawn in window pixels, then averaged
+CANVAS_ROWS = math.ceil(
+    QUARTER_ROWS * PIXEL_H
+)  # a quarter is drawn in window pixels, then averaged
 CANVAS_COLUMNS = math.ceil(QUARTER_COLUMNS * PIXEL_W)
 TURN_STEPS, MAX_TURN = 24, 12  # a wheel's angle to the hull: steps of 1/24 rad, at most 12 of them
 PHASE_STEPS = 32  # a wheel's rotation: steps of 2 pi / 32
 CORNERS = 8  # of a polygon of the car; those with fewer corners repeat the last
-HULL_POLYGONS = np.array(  # world units
-    [
-        polygon + polygon[-1:] * (CORNERS - len(polygon))
-        for polygon in (
-            car_dynamics.HULL_POLY1,
-            car_dynamics.HULL_POLY2,
-            car_dynamics.HULL_POLY3,
-            car_dynamics.HULL_POLY4,
-        )
-    ]
-) * float(car_dynamics.SIZE)
+HULL_POLYGONS = (
+    np.array(  # world units
+        [
+            polygon + polygon[-1:] * (CORNERS - len(polygon))
+            for polygon in (
+                car_dynamics.HULL_POLY1,
+                car_dynamics.HULL_POLY2,
+                car_dynamics.HULL_POLY3,
+                car_dynamics.HULL_POLY4,
+            )
+        ]
+    )
+    * float(car_dynamics.SIZE)
+)
 WHEEL_PLACES = np.array(car_dynamics.WHEELPOS) * car_dynamics.SIZE  # world units
 WHEEL_HALF_WIDTH = car_dynamics.WHEEL_W * car_dynamics.SIZE
 WHEEL_RADIUS = car_dynamics.WHEEL_R * car_dynamics.SIZE
@@ -624,7 +631,9 @@ def smooth_edges(pixels, nearest, texels, palette, columns, start, across, down,
             color = interpolate(texels, palette, x, y)
         else:  # the mean of two, a quarter of a pixel to either side
             shift_x, shift_y = across[0] >> 2, across[1] >> 2
-            color = (interpolate(texels, palette, x - shift_x, y - shift_y) >> np.uint64(1)) & HALVES
+            color = (
+                interpolate(texels, palette, x - shift_x, y - shift_y) >> np.uint64(1)
+            ) & HALVES
             more = interpolate(texels, palette, x + shift_x, y + shift_y)
             color += (more >> np.uint64(1)) & HALVES
         write(pixels, np.uint64(3) * np.uint64(pixel), color)
@@ -977,6 +986,39 @@ def draw_pictures(out, ground, pictures, hulls, wheels, rewards, times, bar):
         draw_picture(out[car], ground, pictures, car, hull, wheel, reward, time, bar)
 
 
+@compiled
+def draw_cars(out, ground, pictures, which, cars, roads, tiles, bar):
+    """Draw what some cars see; tiles that they have touched since the last time change colour.
+
+    Args:
+        out: uint8 (n, 96, 96, 3) or (n, 64, 64, 3), to write.
+        ground: the painted Ground of all cars.
+        pictures: from `make_pictures`.
+        which: int64 (n,), numbers of the cars.
+        cars, roads: `physics.CAR` and `physics.ROAD` (cars,).
+        tiles: float64 (cars, MAX_TILES, 4, 2), corners of the tiles in world units.
+        bar: whether to draw the indicator bar.
+    """
+    hull, wheels = np.empty(5), np.empty((4, 3))
+    for n in range(len(which)):
+        number = which[n]
+        car, road = cars[number], roads[number]
+        for tile in range(road.tiles):
+            if road.darkened[tile] == 1:
+                road.darkened[tile] = 2  # and painted
+                visit(ground, number, tiles[number, tile])
+        hull[0], hull[1], hull[2] = car.position[0, 0], car.position[0, 1], car.angle[0]
+        hull[3] = math.sqrt(car.velocity[0, 0] ** 2 + car.velocity[0, 1] ** 2)
+        hull[4] = car.velocity[0, 2]
+        for i in range(4):
+            wheels[i, 0] = car.angle[1 + i] - car.angle[0]
+            wheels[i, 1], wheels[i, 2] = car.phase[i], car.omega[i]
+        shown = (
+            car.reward + 0.1 if car.frames else car.reward
+        )  # Gymnasium draws before it takes 0.1
+        draw_picture(out[n], ground, pictures, number, hull, wheels, shown, car.time, bar)
+
+
 # Tables, made once
 
 
@@ -1024,4 +1066,3 @@ def score_picture(font: pygame.font.Font, text: str) -> np.ndarray:
     surface.blit(label, label.get_rect(center=(60, WINDOW_H * 2.5 / 40)))
     small = pygame.transform.smoothscale(surface, (SCORE_COLUMNS, BAR_ROWS))
     return pygame.surfarray.array3d(small)[:, :, 0].T
-

@@ -1,0 +1,140 @@
+"""CarRacing-v3 for many cars at once, as a native `gymnasium.vector.VectorEnv`.
+
+envs = gymnasium.make_vec(
+    "stad_lab:StadLab/CarRacing-v3", num_envs=16, vectorization_mode="vector_entry_point"
+)
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+from stad_lab.envs import physics
+from stad_lab.envs.car_racing import MAX_FRAMES, spaces
+from stad_lab.envs.cars import Cars
+
+
+class CarRacingVector(gym.vector.VectorEnv):
+    """`num_envs` cars, each with its own track.
+
+    Args:
+        num_envs: number of cars.
+        max_episode_steps: frames after which an episode is truncated.
+        autoreset_mode: NEXT_STEP (Gymnasium's default): the step after an episode's end begins a
+            new one and ignores the action. SAME_STEP: the new episode begins at once, and `info`
+            has "final_obs" and "final_info". DISABLED: the caller resets with
+            `options={"reset_mask": ...}`.
+        bar: whether to draw the indicator bar.
+        render_mode: None; a batch has no window.
+        continuous, lap_complete_percent, domain_randomize: as Gymnasium's.
+
+    Attributes:
+        cars: the engine's `Cars`.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        max_episode_steps: int = MAX_FRAMES,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        bar: bool = True,
+        render_mode: str | None = None,
+        continuous: bool = True,
+        lap_complete_percent: float = 0.95,
+        domain_randomize: bool = False,
+    ):
+        if num_envs < 1 or max_episode_steps < 1 or render_mode is not None:
+            raise ValueError(
+                f"num_envs={num_envs}, max_episode_steps={max_episode_steps},"
+                f" render_mode={render_mode!r}: expected at least 1, at least 1, and None"
+            )
+        self.num_envs, self.max_episode_steps = num_envs, max_episode_steps
+        self.autoreset_mode, self.render_mode = AutoresetMode(autoreset_mode), render_mode
+        self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
+        rules = (continuous, lap_complete_percent, domain_randomize)
+        self.single_observation_space, self.single_action_space = spaces(continuous)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.cars = Cars(num_envs, "observation", bar, *rules)
+        self._ended = np.ones(num_envs, bool)  # until the first reset
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict | None = None
+    ) -> tuple[np.ndarray, dict]:
+        """Begin new episodes.
+
+        Args:
+            seed: of the tracks: one for each car, or n for n, n + 1, ...
+            options: "reset_mask", bool (num_envs,), to reset only some cars; and "randomize", as
+                for `CarRacing.reset`.
+
+        Returns:
+            Observations, uint8 (num_envs, 96, 96, 3), and {}.
+        """
+        options = options or {}
+        mask = options.get("reset_mask", np.ones(self.num_envs, bool))
+        if np.shape(mask) != (self.num_envs,) or not np.any(mask):
+            raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), one at least")
+        if seed is None or isinstance(seed, int | np.integer):
+            seed = [None if seed is None else seed + car for car in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ValueError(f"{len(seed)} seeds: expected {self.num_envs}, one for each car")
+        which = np.flatnonzero(mask)
+        self.cars.reset([seed[car] for car in which], which, options.get("randomize", True))
+        self._ended[which] = False
+        return self.cars.draw(), {}
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Drive all cars one frame; see Gymnasium's VectorEnv for what is returned.
+
+        Raises:
+            ValueError: an action that is not finite or not one of the five.
+            RuntimeError: a car whose episode has ended must be reset first.
+        """
+        begin = np.flatnonzero(self._ended)
+        if len(begin) and self.autoreset_mode != AutoresetMode.NEXT_STEP:
+            raise RuntimeError(f"cars {begin.tolist()}: their episodes have ended, call reset")
+        driving, rewards = np.flatnonzero(~self._ended), np.zeros(self.num_envs)
+        terminated = np.zeros(self.num_envs, bool)
+        actions = np.asarray(actions)[driving]
+        rewards[driving], terminated[driving] = self.cars.step(actions, driving)
+        self.cars.reset(which=begin)
+        truncated = self.cars.cars["frames"] >= self.max_episode_steps
+        self._ended = terminated | truncated
+        info = self._info(terminated)
+        observations = self.cars.draw()
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
+            info = self._begin_again(observations, info)
+        return observations, rewards, terminated, truncated, info
+
+    def close_extras(self, **kwargs) -> None:
+        """Release the memory of the tracks."""
+        self.cars = None
+
+    def _info(self, terminated: np.ndarray) -> dict:
+        if not terminated.any():
+            return {}
+        finished = self.cars.cars["ending"] == physics.LAP_FINISHED
+        return {"lap_finished": finished & terminated, "_lap_finished": terminated.copy()}
+
+    def _begin_again(self, observations: np.ndarray, info: dict) -> dict:
+        """Reset the ended cars in place; returns the info of this step."""
+        ended = self._ended.copy()
+        which, final = np.flatnonzero(ended), np.full(self.num_envs, None, object)
+        for car in which:
+            final[car] = observations[car].copy()
+        self.cars.reset(which=which)
+        observations[which] = self.cars.draw(which)
+        self._ended[:] = False
+        return {
+            "final_obs": final,
+            "_final_obs": ended,
+            "final_info": info,
+            "_final_info": ended.copy(),
+        }
