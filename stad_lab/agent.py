@@ -13,7 +13,14 @@ import numpy as np
 import torch
 
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
-from stad_lab.envs.frames import FrameMemory, earlier_frames, to_frame, to_pictures
+from stad_lab.envs.cars import Cars
+from stad_lab.envs.frames import (
+    FRAME_SIZE,
+    FrameMemory,
+    earlier_frames,
+    to_frame,
+    to_pictures,
+)
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
     WorldModel,
@@ -21,6 +28,7 @@ from stad_lab.io.weights import (
     load_controller,
     load_world_model,
 )
+from stad_lab.io.workers import check_cancelled
 from stad_lab.models.controller import check_parameters, control, parameter_count
 from stad_lab.models.mdn_rnn import MDNRNN, State
 from stad_lab.models.vae import VAE, to_tensor
@@ -70,15 +78,21 @@ class Agent:
         return self.act_batch([observation])[0]
 
     @torch.inference_mode()
-    def act_batch(self, observations: Sequence[np.ndarray]) -> np.ndarray:
-        """The actions for a batch of cars: uint8 (cars, 96, 96, 3) -> float32 (cars, 3).
+    def act_batch(self, seen: Sequence[np.ndarray]) -> np.ndarray:
+        """The actions for a batch of cars: float32 (cars, 3).
+
+        Args:
+            seen: observations, uint8 (cars, 96, 96, 3), or frames, uint8 (cars, 64, 64, 3), with
+                the bar cropped as V was trained.
 
         Raises:
             ValueError: as `act`, or another number of cars than before without a `reset`.
         """
-        self._check_count(len(observations))
-        crop_bar = self.world_model.crop_bar
-        frames = np.stack([to_frame(observation, crop_bar) for observation in observations])
+        self._check_count(len(seen))
+        if seen[0].shape[:2] == (FRAME_SIZE, FRAME_SIZE):
+            frames = np.asarray(seen)
+        else:
+            frames = np.stack([to_frame(one, self.world_model.crop_bar) for one in seen])
         if self.state is None:
             self.cars = np.arange(len(frames))
             zeros = torch.zeros(1, len(frames), self.mdn_rnn.hidden_size, dtype=torch.float32)
@@ -137,11 +151,54 @@ class Driver(Protocol):
     def reset(self) -> None:
         """Begin new episodes."""
 
-    def act_batch(self, observations: Sequence[np.ndarray]) -> np.ndarray:
-        """Actions float32 (cars, 3) for the observations of the present cars."""
+    def act_batch(self, seen: np.ndarray) -> np.ndarray:
+        """Actions float32 (cars, 3) for what the present cars see."""
 
     def keep(self, cars: np.ndarray) -> None:
         """Continue with some of the present cars, by their indices."""
+
+
+class Batch(Protocol):
+    """What `rollout` drives: the engine's `Cars`, or `EnvBatch`."""
+
+    def __len__(self) -> int:
+        """Number of cars."""
+
+    def draw(self, which: np.ndarray) -> np.ndarray:
+        """What some cars see: uint8 (n, 96, 96, 3) or (n, 64, 64, 3)."""
+
+    def step(self, actions: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Drive some cars one frame: their rewards, and whether their episodes have ended."""
+
+
+class EnvBatch:
+    """Gymnasium environments, which have been reset, as a batch; each is closed at its end.
+
+    Args:
+        envs: the environments.
+        observations: their first observations.
+    """
+
+    def __init__(self, envs: Sequence[gym.Env], observations: Sequence[np.ndarray]):
+        self.envs, self.observations = envs, list(observations)
+
+    def __len__(self) -> int:
+        return len(self.envs)
+
+    def draw(self, which: np.ndarray) -> np.ndarray:
+        """The observations of some cars, uint8 (n, 96, 96, 3)."""
+        return np.stack([self.observations[car] for car in which])
+
+    def step(self, actions: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `Batch.step`."""
+        rewards, ended = np.zeros(len(which)), np.zeros(len(which), bool)
+        for place, (car, action) in enumerate(zip(which, actions, strict=True)):
+            found = self.envs[car].step(action)
+            self.observations[car], rewards[place] = found[:2]
+            ended[place] = found[2] or found[3]
+            if ended[place]:
+                self.envs[car].close()
+        return rewards, ended
 
 
 class Episodes(NamedTuple):
@@ -155,75 +212,75 @@ class Episodes(NamedTuple):
     """Of every frame, for each episode."""
 
 
-Observe = Callable[[int, gym.Env, np.ndarray, np.ndarray], None]
+Observe = Callable[[np.ndarray, np.ndarray, np.ndarray], None]
 
 
 def rollout(
     driver: Driver,
-    envs: Sequence[gym.Env],
-    observations: Sequence[np.ndarray],
+    batch: Batch,
     max_frames: int = MAX_FRAMES,
     patience: int = 0,
     observe: Observe | None = None,
 ) -> Episodes:
-    """Drive one episode in each environment, all cars in one batch, and close the environments.
+    """Drive one episode with each car of a batch.
 
     Args:
-        driver: called with the observations of the cars whose episodes go on.
-        envs: environments that have been reset.
-        observations: their first observations.
+        driver: is shown what the cars see whose episodes go on.
+        batch: of cars at the start of their episodes.
         max_frames: frames of an episode, at most (CarRacing's own limit is 1,000).
         patience: an episode ends after so many frames without a new tile; 0 for never.
-        observe: called before every step with the number of the episode, its environment, the
-            observation and the action, for example to record them.
+        observe: called before every step with the numbers of the cars, what they see and their
+            actions, for example to record them.
     """
     if max_frames < 1:
         raise ValueError(f"max_frames={max_frames}: expected at least 1")
-    observations, driving = list(observations), list(range(len(envs)))
-    returns, rewards = np.zeros(len(envs)), [[] for _ in envs]
-    last_tile = np.zeros(len(envs), int)  # the frame in which a car last reached a new tile
+    returns, rewards = np.zeros(len(batch)), [[] for _ in range(len(batch))]
+    last_tile = np.zeros(len(batch), int)  # the frame in which a car last reached a new tile
+    driving = np.arange(len(batch))
     driver.reset()
-    while driving:
-        going_on = []
-        actions = driver.act_batch(observations)
-        for place, (car, action) in enumerate(zip(driving, actions, strict=True)):
-            if observe:
-                observe(car, envs[car], observations[place], action)
-            observations[place], reward, terminated, truncated, _ = envs[car].step(action)
-            returns[car] += reward
+    for length in range(1, min(max_frames, MAX_FRAMES) + 1):
+        check_cancelled()
+        seen = batch.draw(driving)
+        actions = driver.act_batch(seen)
+        if observe:
+            observe(driving, seen, actions)
+        gained, ended = batch.step(actions, driving)
+        returns[driving] += gained
+        for car, reward in zip(driving, gained.tolist(), strict=True):
             rewards[car].append(reward)
-            length = len(rewards[car])
-            if reward > 0:
-                last_tile[car] = length
-            lost = patience and length - last_tile[car] >= patience
-            if terminated or truncated or lost or length >= max_frames:
-                envs[car].close()  # releases its painted track
-            else:
-                going_on.append(place)
-        if len(going_on) < len(driving):
-            driving = [driving[place] for place in going_on]
-            observations = [observations[place] for place in going_on]
-            if going_on:
-                driver.keep(np.array(going_on))
+        last_tile[driving[gained > 0]] = length
+        going_on = ~ended
+        if patience:
+            going_on &= length - last_tile[driving] < patience
+        if not going_on.all():
+            driving = driving[going_on]
+            if not len(driving):
+                break
+            driver.keep(np.flatnonzero(going_on))
     return Episodes(returns, np.array([len(own) for own in rewards]), rewards)
 
 
 def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> Episodes:
-    """Let an agent drive one episode on each track, from rest. Each car holds 16 MB.
+    """Let an agent drive one episode on each track, from rest. Each car holds 5 MB.
 
     Args:
         agent: its parameters are one vector, or one row for each track.
         tracks: seeds of the tracks, at least 0.
-        fast: render with the fast renderer, or with Gymnasium's own.
+        fast: drive with our engine, which draws the agent's frames directly, or in Gymnasium's own
+            environment.
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
     """
     tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
     if min(tracks, default=0) < 0:
         raise ValueError(f"track {min(tracks)}: expected at least 0, the seed of a track")
-    unseen = {"bar": False} if fast and agent.world_model.crop_bar else {}  # V would crop it
-    envs = [make_env(fast, **unseen) for _ in tracks]
-    observations = [env.reset(seed=track)[0] for env, track in zip(envs, tracks, strict=True)]
-    return rollout(agent, envs, observations, **limits)
+    if fast:
+        batch = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)
+        batch.reset(tracks)
+    else:
+        envs = [make_env(fast=False) for _ in tracks]
+        pairs = zip(envs, tracks, strict=True)
+        batch = EnvBatch(envs, [env.reset(seed=track)[0] for env, track in pairs])
+    return rollout(agent, batch, **limits)
 
 
 @torch.no_grad()

@@ -16,7 +16,7 @@ from stad_lab.agent import Agent, load_agent, run_folder
 from stad_lab.config import TRACK_RANGES
 from stad_lab.evaluation.statistics import SOLVED, summarise
 from stad_lab.io.files import checksum_of_arrays, checksum_of_tensors, load_json, save_json
-from stad_lab.io.workers import run_tasks, worker_processes
+from stad_lab.io.workers import run_tasks, worker_processes, worker_threads
 from stad_lab.training.evolution import drive_group, hand_out
 from stad_lab.training.pipeline import RUN_FILES
 
@@ -39,8 +39,8 @@ def evaluate(
         source: of the agent, as for `load_agent`.
         episodes: number of tracks, each driven once, to its end.
         fast: render with the fast renderer instead of Gymnasium's own.
-        processes: worker processes; the numbers do not depend on them.
-        executor: who drives; None for so many processes of this machine.
+        processes: workers: threads, or processes for Gymnasium's renderer; the numbers do not depend on them.
+        executor: who drives; None for so many workers of this machine.
         unfinished: file that keeps what was driven, so that an interrupted evaluation continues.
 
     Returns:
@@ -60,7 +60,8 @@ def evaluate(
     driven = known["driven"] if known.get("asked") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]
-    with worker_processes(processes, executor) as executor:
+    workers = worker_threads if fast else worker_processes
+    with workers(processes, executor) as executor:
         # One car at a time: in a batch the last bits differ from those of a car that drives alone.
         share = hand_out(executor, run_folder(source))
         tasks = [(share, agent.parameters, [track], fast) for track in missing]

@@ -7,14 +7,14 @@ know the motion: here it is read from the simulator. The tracks are from a range
 
 from dataclasses import dataclass
 
-import gymnasium as gym
 import numpy as np
 import torch
 
 from stad_lab.agent import Agent, Driver, encode_episode, remember_episode, rollout
 from stad_lab.config import Config
-from stad_lab.envs.car_racing import TRACK_WIDTH, make_env
+from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import episode_differences, to_frame
+from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.io.weights import WorldModel
 from stad_lab.models.mdn_rnn import Mixture
 from stad_lab.models.vae import VAE, to_array, to_uint8
@@ -53,14 +53,15 @@ class Trajectory:
 
 
 class Recorder:
-    """Keeps what a trajectory needs, as `observe` of `rollout`."""
+    """Keeps what a trajectory of one car needs, as `observe` of `rollout`."""
 
-    def __init__(self):
+    def __init__(self, cars: Cars):
+        self.cars = cars
         self.rows: list[tuple] = []
 
-    def __call__(self, _: int, env: gym.Env, observation: np.ndarray, action: np.ndarray) -> None:
+    def __call__(self, _: np.ndarray, seen: np.ndarray, actions: np.ndarray) -> None:
         """Keep one moment."""
-        self.rows.append((observation, action, true_motion(env)))
+        self.rows.append((seen[0], actions[0], true_motion(self.cars)))
 
     def trajectory(self, rewards: list[float]) -> Trajectory:
         """The trajectory so far. ValueError if there is no frame."""
@@ -70,19 +71,18 @@ class Recorder:
         return Trajectory(observations, actions, np.array(rewards, np.float32), motion)
 
 
-def true_motion(env: gym.Env) -> np.ndarray:
-    """The car's motion and its place on the road, from the simulator: float32 (6,), see MOTION."""
-    racing = env.unwrapped
-    hull, track = racing.car.hull, np.array(racing.track)  # of a tile: progress, direction, x, y
-    along, across = (
-        np.dot(hull.linearVelocity, hull.GetWorldVector(axis)) for axis in ((0, 1), (1, 0))
-    )
-    distances = np.hypot(track[:, 2] - hull.position.x, track[:, 3] - hull.position.y)
-    _, direction, x, y = track[distances.argmin()]
-    offset = (hull.position.x - x) * np.cos(direction) + (hull.position.y - y) * np.sin(direction)
-    turned = (hull.angle - direction + np.pi) % (2 * np.pi) - np.pi
-    wheel = racing.car.wheels[0].joint.angle
-    motion = [along, across, hull.angularVelocity, wheel, offset / TRACK_WIDTH, turned]
+def true_motion(cars: Cars, car: int = 0) -> np.ndarray:
+    """A car's motion and its place on the road, from the engine: float32 (6,), see MOTION."""
+    state, path = cars.cars[car], cars.tracks[car].path  # of a tile: progress, direction, x, y
+    velocity, angle = state["velocity"][0], float(state["angle"][0])
+    along = -np.sin(angle) * velocity[0] + np.cos(angle) * velocity[1]
+    across = np.cos(angle) * velocity[0] + np.sin(angle) * velocity[1]
+    x, y = state["position"][0]
+    _, direction, tile_x, tile_y = path[np.hypot(path[:, 2] - x, path[:, 3] - y).argmin()]
+    offset = (x - tile_x) * np.cos(direction) + (y - tile_y) * np.sin(direction)
+    turned = (angle - direction + np.pi) % (2 * np.pi) - np.pi
+    wheel = state["angle"][1] - state["angle"][0]
+    motion = [along, across, velocity[2], wheel, offset / TRACK_WIDTH, turned]
     return np.array(motion, np.float32)
 
 
@@ -110,24 +110,24 @@ def road_in_sight(motion: np.ndarray) -> np.ndarray:
     return (np.abs(offset) < 3) & (np.abs(turned) < np.pi / 2)
 
 
-def record(driver: Driver, env: gym.Env, observation: np.ndarray, frames: int) -> Trajectory:
-    """Drive on from `observation`, for at most so many frames, and close the environment."""
-    recorder = Recorder()
-    episodes = rollout(driver, [env], [observation], max_frames=frames, observe=recorder)
+def record(driver: Driver, cars: Cars, frames: int) -> Trajectory:
+    """Drive one car on, for at most so many frames."""
+    recorder = Recorder(cars)
+    episodes = rollout(driver, cars, max_frames=frames, observe=recorder)
     return recorder.trajectory(episodes.rewards[0])
 
 
 def record_random_trajectory(config: Config, index: int) -> Trajectory:
     """An episode of the random driver as in the dataset, but on a track kept for inspection."""
-    env, observation, driver = random_start(config, index, use="inspect")
-    return record(driver, env, observation, config.data.episode_frames)
+    cars, driver = random_start(config, index, use="inspect", shows="observation")
+    return record(driver, cars, config.data.episode_frames)
 
 
 def record_trajectory(agent: Agent, track: int, frames: int) -> Trajectory:
     """An episode of an agent from the start of a track, at most `frames` long."""
-    env = make_env()
-    observation, _ = env.reset(seed=int(track))
-    return record(agent, env, observation, frames)
+    cars = Cars(1)
+    cars.reset([track])
+    return record(agent, cars, frames)
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,11 @@
-"""Worker processes: who drives the cars for collecting, evolving and evaluating.
+"""Who drives the cars: threads for our engine, processes for Gymnasium's own environment.
 
-Any `concurrent.futures.Executor` serves; `WorkerProcesses` is that of one machine. What a task
-returns depends on its arguments alone, so the work of a lost worker is simply done again.
+The engine and PyTorch release Python's global lock, so a few threads fill the cores. Gymnasium's
+environment is Python code and needs processes. Any `concurrent.futures.Executor` serves in their
+place, for example that of a Dask cluster. What a task returns depends on its arguments alone.
 """
 
-import functools
+import contextvars
 import itertools
 import multiprocessing
 import operator
@@ -19,6 +20,7 @@ from concurrent.futures import (
     Executor,
     Future,
     ProcessPoolExecutor,
+    ThreadPoolExecutor,
     wait,
 )
 from concurrent.futures.process import BrokenProcessPool
@@ -31,104 +33,101 @@ from tqdm.auto import tqdm
 
 import stad_lab
 
-PRELOADED = ["stad_lab.training.pipeline"]  # a worker's imports take 2 to 4 seconds
+PRELOADED = ["stad_lab.training.evolution"]  # a worker's imports take 2 to 4 seconds
 PATIENCE = 3600.0  # seconds without any finished task, after which the workers count as stuck
-SLICES = 60  # in which the waiting is counted, so that a suspended machine loses one slice
-LOSSES = 3  # pools that may be lost in a row
+SLICES = 3600  # in which the waiting is counted: a suspended machine loses one of them
+
+# Set in a thread whose work nobody waits for any more; `rollout` looks at it in every frame.
+CANCELLED: contextvars.ContextVar[threading.Event | None] = contextvars.ContextVar(
+    "cancelled", default=None
+)
 
 
 class TaskError(RuntimeError):
     """A task failed in a worker, or none was finished for too long."""
 
 
-class WorkerProcesses(Executor):
-    """A pool of fresh Python processes with one thread each, that outlives its workers.
+class WorkerThreads(ThreadPoolExecutor):
+    """A pool of threads whose rollouts can be stopped.
 
-    When a worker is killed, Python's own pool is broken for good: a new one then takes over what
-    was not finished.
+    Raises:
+        ValueError: fewer than 1 thread.
+    """
+
+    def __init__(self, count: int):
+        super().__init__(check_count(count), "driver")
+        self.cancelled = threading.Event()
+
+    def submit(self, function: Callable, /, *arguments, **named) -> Future:
+        """As for every Executor."""
+        return super().submit(self._run, function, *arguments, **named)
+
+    def _run(self, function: Callable, *arguments, **named) -> object:
+        CANCELLED.set(self.cancelled)
+        return function(*arguments, **named)
+
+
+def check_cancelled() -> None:
+    """Raise CancelledError in a thread whose pool was stopped."""
+    event = CANCELLED.get()
+    if event is not None and event.is_set():
+        raise CancelledError("the rollout was stopped")
+
+
+def check_count(count: int) -> int:
+    """The number of workers. ValueError if there are fewer than 1."""
+    if count < 1:
+        raise ValueError(f"processes={count}: expected at least 1, such as the number of cores")
+    return count
+
+
+@contextmanager
+def worker_threads(count: int, given: Executor | None = None) -> Iterator[Executor]:
+    """A pool of `count` threads for a `with` block; or the given executor, which stays open.
+
+    If the block is left by an interrupt or an error, rollouts stop within a frame.
+    """
+    if given is not None:
+        yield given
+        return
+    executor, threads = WorkerThreads(count), torch.get_num_threads()
+    try:
+        yield executor
+    finally:
+        executor.cancelled.set()
+        executor.shutdown(cancel_futures=True)
+        torch.set_num_threads(threads)  # tasks set it to 1, for all threads that come later
+
+
+@contextmanager
+def worker_processes(count: int, given: Executor | None = None) -> Iterator[Executor]:
+    """A pool of `count` fresh processes for a `with` block; or the given executor.
+
+    The processes ignore Ctrl-C and end with their parent. If the block is left by an interrupt or
+    an error, they are killed.
 
     Raises:
         ValueError: fewer than 1 process, or a script that workers cannot import.
     """
-
-    def __init__(self, count: int):
-        check_script()
-        if count < 1:
-            raise ValueError(f"processes={count}: expected at least 1, such as the number of cores")
-        self.count, self.losses, self.closed = count, 0, False
-        self.others = set(multiprocessing.active_children())
-        self.lock = threading.RLock()
-        self.pool = self._new_pool()
-        self.lost: list[ProcessPoolExecutor] = []  # referenced: dropping a broken one can deadlock
-
-    def submit(self, function: Callable, /, *arguments, **named) -> Future:
-        """As for every Executor."""
-        task = Future()
-        work = functools.partial(run_here, stad_lab.__file__, function, *arguments, **named)
-        self._begin(task, work)
-        return task
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """As for every Executor."""
-        self.closed = True
-        self.pool.shutdown(wait, cancel_futures=cancel_futures)
-
-    def stop(self) -> None:
-        """End the processes at once."""
-        self.closed = True
-        for process in set(multiprocessing.active_children()) - self.others:
+    if given is not None:
+        yield given
+        return
+    check_script()
+    # Not "fork": copies of this process would lack PyTorch's threads.
+    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
+    if sys.platform == "linux":
+        context.set_forkserver_preload(PRELOADED)
+    count = min(check_count(count), 61) if sys.platform == "win32" else check_count(count)
+    others = set(multiprocessing.active_children())
+    executor = ProcessPoolExecutor(count, context, start_worker, (stad_lab.__file__,))
+    try:
+        yield executor
+    except BaseException:
+        for process in set(multiprocessing.active_children()) - others:
             process.kill()
-        self.shutdown(wait=False, cancel_futures=True)
-
-    def _new_pool(self) -> ProcessPoolExecutor:
-        # Not "fork": copies of this process would lack PyTorch's threads.
-        context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
-        if sys.platform == "linux":
-            context.set_forkserver_preload(PRELOADED)
-        count = min(self.count, 61) if sys.platform == "win32" else self.count  # Windows' limit
-        return ProcessPoolExecutor(count, mp_context=context, initializer=start_worker)
-
-    def _begin(self, task: Future, work: Callable) -> None:
-        if task.cancelled():
-            return
-        pool = self.pool
-        try:
-            attempt = pool.submit(work)
-        except Exception as error:  # it broke a moment ago, or no process can be started
-            attempt = Future()
-            attempt.set_exception(error)
-        attempt.add_done_callback(functools.partial(self._end, task, work, pool))
-        task.add_done_callback(lambda done: done.cancelled() and attempt.cancel())
-
-    def _end(
-        self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future
-    ) -> None:
-        if attempt.cancelled():
-            task.cancel()
-            return
-        error = attempt.exception()
-        if isinstance(error, BrokenProcessPool) and not self.closed and self._replace(pool):
-            self._begin(task, work)
-            return
-        if not task.set_running_or_notify_cancel():
-            return
-        if error is None:
-            self.losses = 0
-            task.set_result(attempt.result())
-        else:
-            task.set_exception(error)
-
-    def _replace(self, lost: ProcessPoolExecutor) -> bool:
-        """Start a new pool for a lost one, unless that is done; False after too many losses."""
-        with self.lock:
-            if lost is self.pool:
-                self.losses += 1
-                if self.losses > LOSSES:
-                    return False
-                print("a worker process was lost: its work is done again", file=sys.stderr)
-                self.lost.append(lost)
-                self.pool = self._new_pool()
-            return True
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
 
 
 def check_script() -> None:
@@ -141,34 +140,33 @@ def check_script() -> None:
         )
 
 
-def run_here(home: str, function: Callable, *arguments, **named) -> object:
-    """Call a function in a worker, which must have loaded the same stad_lab as its parent."""
+def start_worker(home: str) -> None:
+    """Prepare a worker process, which must have loaded the same stad_lab as its parent."""
     if stad_lab.__file__ != home:
-        raise ValueError(
-            f"a worker process loaded {stad_lab.__file__}, its parent {home}: install the one that"
-            " you use instead of changing sys.path"
+        print(
+            f"error: a worker process loaded {stad_lab.__file__}, its parent {home}: install the"
+            " one that you use instead of changing sys.path",
+            file=sys.stderr,
         )
-    return function(*arguments, **named)
+        os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    single_thread()
+    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
-@contextmanager
-def worker_processes(count: int, given: Executor | None = None) -> Iterator[Executor]:
-    """A pool of `count` processes for a `with` block; or the given executor, which stays open.
+def end_with_parent() -> None:
+    """Wait until the parent process has ended, then end this one."""
+    multiprocessing.parent_process().join()
+    os._exit(1)
 
-    The processes ignore Ctrl-C and end with their parent. If the block is left by an interrupt or
-    an error, they are stopped at once.
+
+def single_thread() -> None:
+    """Compute on one thread from now on: tasks fill the cores, and last bits depend on threads.
+
+    Tasks call it, so that it holds in the workers of any executor.
     """
-    if given is not None:
-        yield given
-        return
-    executor = WorkerProcesses(count)
-    try:
-        yield executor
-    except BaseException:
-        executor.stop()
-        raise
-    finally:
-        executor.shutdown(cancel_futures=True)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
 
 
 def run_tasks(
@@ -221,8 +219,8 @@ def task_errors(name: str) -> Iterator[None]:
         ) from error
     except BrokenProcessPool as error:
         raise TaskError(
-            f"{name}: {LOSSES + 1} times in a row a worker process ended abruptly; was it killed,"
-            " or is memory short? The same command continues"
+            f"{name}: a worker process ended abruptly; was it killed, or is memory short? The same"
+            " command continues"
         ) from error
     except Exception as error:
         raise TaskError(f"{name} failed in a worker: {type(error).__name__}: {error}") from error
@@ -244,26 +242,3 @@ def run_in_order(
     finished = run_tasks(executor, function, tasks)
     bar = tqdm(finished, label, len(tasks), unit="episode", disable=label is None)
     return [result for _, result in sorted(bar, key=operator.itemgetter(0))]
-
-
-def start_worker() -> None:
-    """Prepare a worker process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    single_thread()
-    threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def single_thread() -> None:
-    """Compute on one thread from now on: tasks fill the cores, and last bits depend on threads.
-
-    Tasks call it, so that it holds in the workers of any executor.
-    """
-    if torch.get_num_threads() != 1:
-        torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-
-
-def end_with_parent() -> None:
-    """Wait until the parent process has ended, then end this one."""
-    multiprocessing.parent_process().join()
-    os._exit(1)

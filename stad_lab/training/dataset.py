@@ -14,16 +14,15 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Driver, rollout
 from stad_lab.config import Config, check_same, random_stream, track_seeds
-from stad_lab.envs.car_racing import make_env, place_car
-from stad_lab.envs.frames import FRAME_SIZE, earlier_index, to_frame
+from stad_lab.envs.cars import Cars
+from stad_lab.envs.frames import FRAME_SIZE, earlier_index
 from stad_lab.io.files import checksum, load_json, locked, read_bytes, save_json, write_bytes
-from stad_lab.io.workers import run_tasks, single_thread, worker_processes
+from stad_lab.io.workers import run_tasks, worker_threads
 
 MANIFEST = "manifest.json"
 NPY_HEADER = 128  # bytes before the array in a file of np.save, for an array of a few dimensions
@@ -60,7 +59,7 @@ class RandomDriver:
         action = [np.clip(self.steering, -1, 1), np.clip(self.gas, 0, 1) * (not brake), brake]
         return np.array(action, np.float32)
 
-    def act_batch(self, observations: Sequence[np.ndarray]) -> np.ndarray:
+    def act_batch(self, seen: np.ndarray) -> np.ndarray:
         """The action of the only car, float32 (1, 3)."""
         return self.act()[None]
 
@@ -69,31 +68,29 @@ class RandomDriver:
 
 
 def random_start(
-    config: Config, index: int, use: str = "collect"
-) -> tuple[gym.Env, np.ndarray, RandomDriver]:
-    """Put the car where episode `index` of the random driver begins.
+    config: Config, index: int, use: str = "collect", shows: str = "frame"
+) -> tuple[Cars, RandomDriver]:
+    """A car where episode `index` of the random driver begins, and the driver.
 
     Most episodes start moving on a random tile; otherwise the data would hold little but the first
     bend and grass.
 
     Args:
         use: whose tracks to take, a key of TRACK_RANGES.
-
-    Returns:
-        The environment, its first observation uint8 (96, 96, 3), and the driver.
+        shows: what the car sees, as for `Cars`.
     """
     rng = random_stream("random driver", config.seed, index)
-    env = make_env(fast=True, bar=use != "collect" or not config.data.crop_bar)
-    observation, _ = env.reset(seed=track_of(config, index, use))
+    cars = Cars(1, shows, bar=shows == "observation" or not config.data.crop_bar)
+    cars.reset([track_of(config, index, use)])
     if rng.random() < config.data.random_starts:
-        observation = place_car(
-            env,
+        cars.place(
+            0,
             tile=int(rng.integers(10_000)),
             speed=rng.uniform(0, 90),
             turn=0.15 * rng.standard_normal(),
             offset=rng.uniform(-0.7, 0.7),
         )
-    return env, observation, RandomDriver(rng)
+    return cars, RandomDriver(rng)
 
 
 def track_of(config: Config, index: int, use: str = "collect") -> int:
@@ -102,25 +99,21 @@ def track_of(config: Config, index: int, use: str = "collect") -> int:
 
 
 def drive_randomly(config: Config, index: int) -> Episode:
-    """Drive episode `index` of the random driver. Runs in a worker process."""
-    single_thread()
-    env, observation, driver = random_start(config, index)
-    limits = {"max_frames": config.data.episode_frames}
-    pair = record_frames(driver, env, observation, config.data.crop_bar, **limits)
+    """Drive episode `index` of the random driver. Runs in a worker."""
+    cars, driver = random_start(config, index)
+    pair = record_frames(driver, cars, max_frames=config.data.episode_frames)
     return *pair, track_of(config, index)
 
 
-def record_frames(
-    driver: Driver, env: gym.Env, observation: np.ndarray, crop_bar: bool, **limits
-) -> tuple[np.ndarray, np.ndarray]:
+def record_frames(driver: Driver, cars: Cars, **limits) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode and keep its frames and the action taken on each."""
     frames, actions = [], []
 
-    def observe(_: int, env: gym.Env, observation: np.ndarray, action: np.ndarray) -> None:
-        frames.append(to_frame(observation, crop_bar))
-        actions.append(action)
+    def observe(_: np.ndarray, seen: np.ndarray, action: np.ndarray) -> None:
+        frames.append(seen[0])
+        actions.append(action[0])
 
-    rollout(driver, [env], [observation], observe=observe, **limits)
+    rollout(driver, cars, observe=observe, **limits)
     return np.array(frames), np.array(actions)
 
 
@@ -128,7 +121,7 @@ def collect(config: Config, folder: Path, executor: Executor | None = None) -> b
     """Collect the random driver's episodes into `folder`, or those that are missing.
 
     Args:
-        executor: who drives; None for `config.processes` processes of this machine.
+        executor: who drives; None for `config.processes` threads of this machine.
 
     Returns:
         False if everything was there already.
@@ -140,7 +133,7 @@ def collect(config: Config, folder: Path, executor: Executor | None = None) -> b
     """
     tasks = [(config, index) for index in range(config.data.episodes)]
     longest = [config.data.episode_frames] * len(tasks)
-    with worker_processes(config.processes, executor) as executor:
+    with worker_threads(config.processes, executor) as executor:
         return collect_episodes(folder, made_with(config), drive_randomly, tasks, longest, executor)
 
 

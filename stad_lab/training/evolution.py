@@ -31,7 +31,7 @@ from stad_lab.io.weights import (
     load_world_model,
     save_controller,
 )
-from stad_lab.io.workers import run_in_order, single_thread, worker_processes
+from stad_lab.io.workers import run_in_order, single_thread, worker_threads
 from stad_lab.training.subspace import SearchSpace, search_space
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def evolve(
     kept: to keep the best *candidate* would be to keep the one with the easiest tracks.
 
     Args:
-        executor: who drives; None for `config.processes` processes of this machine.
+        executor: who drives; None for `config.processes` threads of this machine.
         watch: called with the log's generations after each of them, and with those of an earlier
             call.
 
@@ -98,7 +98,7 @@ def evolve(
         if log["best"] and kept != log["best"]["generation"]:
             best = averaged_mean(run.means[: log["best"]["generation"]], settings)
             keep_controller(run, run.space.expand(best))
-        with worker_processes(config.processes, executor) as executor:
+        with worker_threads(config.processes, executor) as executor:
             source = hand_out(executor, folder)
             label = f"evolve C ({config.variant})"
             bar = tqdm(range(done, settings.generations), label, settings.generations, initial=done)
@@ -186,7 +186,7 @@ def make_strategy(
     Args:
         random: entropy and spawn key of the strategy's own random numbers.
     """
-    import cma  # here, because it takes two seconds and workers do not need it
+    import cma  # here, because it takes two seconds and drivers do not need it
     from cma import sigma_adaptation
 
     rules = {"CSA": sigma_adaptation.CMAAdaptSigmaCSA, "TPA": sigma_adaptation.CMAAdaptSigmaTPA}
@@ -389,7 +389,7 @@ def drive_parallel(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive one episode for each row of `parameters`, in groups of at most `settings.cars`.
 
-    The groups do not depend on the number of processes, so neither do the numbers.
+    The groups do not depend on the number of threads, so neither do the numbers.
 
     Returns:
         The returns and the lengths in frames, (episodes,).
@@ -409,7 +409,7 @@ def drive_group(
     fast: bool = True,
     limits: dict | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Drive a group of cars: (returns, lengths). Runs in a worker process."""
+    """Drive a group of cars: (returns, lengths). Runs in a worker."""
     single_thread()
     episodes = drive(make_agent(source, parameters), tracks, fast, **limits or {})
     return episodes.returns, episodes.lengths

@@ -36,7 +36,7 @@ from stad_lab.io.weights import (
     load_vae,
     load_world_model,
 )
-from stad_lab.io.workers import check_script, worker_processes
+from stad_lab.io.workers import worker_threads
 from stad_lab.training.dataset import (
     MANIFEST,
     Dataset,
@@ -62,7 +62,7 @@ RECORD = "record.json"
 WEIGHTS = (VAE_FILE, MDN_RNN_FILE, START_FILE, COMPONENTS_FILE, CONTROLLER_FILE)
 RUN_FILES = (*WEIGHTS, LOG, RECORD, MANIFEST)
 PACKAGES = (
-    "torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless",
+    "torch", "numpy", "numba", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless",
     "safetensors",
 )  # fmt: skip
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
@@ -87,7 +87,7 @@ def train(
         folder: of the run; made if missing.
         dataset_folder: where the dataset is, or goes; None for `folder/dataset`.
         until: the last stage, one of STAGES.
-        executor: who drives; None for `config.processes` processes of this machine.
+        executor: who drives; None for `config.processes` threads of this machine.
         earlier: in a second iteration, the folder of the run whose agent drives
             `data.agent_episodes` for the dataset, and whose C is carried over.
 
@@ -99,7 +99,6 @@ def train(
         OSError: another process works in the folder, or a file cannot be read or written.
         TaskError, FloatingPointError: as raised by the stages.
     """
-    check_script()
     if until not in STAGES:
         raise ValueError(f"unknown stage {until!r}: choose one of {', '.join(STAGES)}")
     if (config.data.agent_episodes > 0) != (earlier is not None):
@@ -187,7 +186,7 @@ def run_stages(
             did = True  # an interrupted stage has worked, too
             with timed(record, name, folder):
                 try:
-                    with worker_processes(config.processes, executor) as pool:
+                    with worker_threads(config.processes, executor) as pool:
                         did = stage(pool)
                 except (ValueError, OSError):  # refused: nothing was done
                     did = False

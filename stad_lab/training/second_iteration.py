@@ -8,7 +8,7 @@ regression finds the C with the same outputs on the new z and h, and evolution s
 costs no episode. (World Models, section 5, proposes such iterations for harder tasks.)
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from stad_lab.agent import Agent, features_of, load_agent
 from stad_lab.config import Config, random_stream, track_seeds
-from stad_lab.envs.car_racing import make_env
+from stad_lab.envs.cars import Cars
 from stad_lab.io.files import checksum_of_arrays
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
@@ -24,7 +24,7 @@ from stad_lab.io.weights import (
     load_controller,
     load_world_model,
 )
-from stad_lab.io.workers import single_thread, worker_processes
+from stad_lab.io.workers import single_thread, worker_threads
 from stad_lab.models.controller import seen_columns, unpack
 from stad_lab.training.dataset import (
     Dataset,
@@ -53,7 +53,7 @@ def collect_again(
 
     Args:
         earlier: folder of the first run, whose agent drives.
-        executor: who drives; None for `config.processes` processes of this machine.
+        executor: who drives; None for `config.processes` threads of this machine.
 
     Returns and raises as `training.dataset.collect`.
     """
@@ -63,7 +63,7 @@ def collect_again(
     longest = [
         data.episode_frames if number < data.episodes else data.agent_frames for number in order
     ]
-    with worker_processes(config.processes, executor) as executor:
+    with worker_threads(config.processes, executor) as executor:
         source = hand_out(executor, earlier)
         tasks = [(source, parameters, config, number) for number in order]
         depends_on = {**made_with(config), "agent": agent}
@@ -97,7 +97,7 @@ def order_of_episodes(config: Config) -> list[int]:
 def drive_either(
     source: Path | WorldModel, parameters: np.ndarray, config: Config, number: int
 ) -> Episode:
-    """Drive one episode of a second iteration. Runs in a worker process."""
+    """Drive one episode of a second iteration. Runs in a worker."""
     if number < config.data.episodes:
         return drive_randomly(config, number)
     single_thread()
@@ -119,9 +119,9 @@ class NoisyDriver:
         """Begin an episode."""
         self.agent.reset()
 
-    def act_batch(self, observations: Sequence[np.ndarray]) -> np.ndarray:
+    def act_batch(self, seen: np.ndarray) -> np.ndarray:
         """The disturbed action of the only car, float32 (1, 3)."""
-        before, actions = self.agent.state, self.agent.act_batch(observations)
+        before, actions = self.agent.state, self.agent.act_batch(seen)
         self.noise = 0.9 * self.noise + self.strength * self.rng.standard_normal(2)
         actions[:, :2] = np.clip(actions[:, :2] + self.noise, [-1, 0], 1)
         self.agent.remember(actions, before)
@@ -136,10 +136,10 @@ def drive_noisily(agent: Agent, config: Config, index: int) -> Episode:
     data = config.data
     driver = NoisyDriver(agent, random_stream("agent driver", config.seed, index))
     track = track_seeds("collect", data.agent_episodes, config.seed, 1)[index]
-    env = make_env(fast=True, bar=not data.crop_bar)
-    observation, _ = env.reset(seed=track)
+    cars = Cars(1, "frame", bar=not data.crop_bar)
+    cars.reset([track])
     limits = {"max_frames": data.agent_frames, "patience": data.agent_patience}
-    return *record_frames(driver, env, observation, data.crop_bar, **limits), track
+    return *record_frames(driver, cars, **limits), track
 
 
 def carry_over(config: Config, earlier: Path, dataset: Callable[[], Dataset], folder: Path) -> bool:
