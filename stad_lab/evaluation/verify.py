@@ -22,7 +22,7 @@ from stad_lab.io.weights import (
     load_vae,
     load_world_model,
 )
-from stad_lab.io.workers import TaskError, run_in_order, worker_processes
+from stad_lab.io.workers import TaskError, run_in_order, worker_processes, worker_threads
 from stad_lab.training.dataset import MANIFEST, Dataset, check_seen, count_episodes
 from stad_lab.training.evolution import (
     LOG,
@@ -184,16 +184,16 @@ def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
     evaluations = [load_evaluation(file) for file in sorted(folder.glob("evaluation*.json"))]
     if not evaluations and lacks(folder, LOG):
         return MISSING
-    with worker_processes(config.processes, executor) as executor:
+    official = [one for one in evaluations if one["renderer"] == "gymnasium"]
+    workers = worker_processes if official else worker_threads
+    with workers(config.processes, executor) as executor:
         source = hand_out(executor, folder)
         if evaluations:
-            first = min(evaluations, key=lambda one: one["renderer"] != "gymnasium")
-            episodes = first["episodes"]
+            episodes = [*official, *evaluations][0]["episodes"]
             chosen = np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)
             recorded = [episodes[number]["return"] for number in chosen]
             tracks = [[episodes[number]["track"]] for number in chosen]
-            fast = first["renderer"] == "fast"
-            tasks = [(source, parameters, track, fast) for track in tracks]
+            tasks = [(source, parameters, track, not official) for track in tracks]
             found = run_in_order(executor, drive_group, tasks)
             driven = [float(returns[0]) for returns, _ in found]
         else:  # all tracks, because last bits depend on the cars that drive in one batch

@@ -55,7 +55,7 @@ from stad_lab.io.weights import (
     load_vae,
     load_world_model,
 )
-from stad_lab.io.workers import run_in_order, worker_processes
+from stad_lab.io.workers import run_in_order, worker_threads
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE, kl_divergence
 from stad_lab.training.dataset import Dataset, collect
@@ -129,13 +129,13 @@ def record_all(
     record: Callable[[int], Trajectory], numbers: list[int], label: str, processes: int
 ) -> list[Trajectory]:
     """`record` of every number, in worker processes."""
-    with worker_processes(processes) as executor:
+    with worker_threads(processes) as executor:
         tasks = [(number,) for number in numbers]
         return run_in_order(executor, record, tasks, f"{label} trajectories")
 
 
 def begin_episode(track: int) -> Trajectory:
-    """The first frames of an episode of AGENT. Runs in a worker process."""
+    """The first frames of an episode of AGENT. Runs in a worker."""
     return record_trajectory(load_agent(AGENT), track, AGENT_FRAMES)
 
 

@@ -24,6 +24,7 @@ import numpy as np
 from stad_lab.agent import rollout
 from stad_lab.config import Config, random_stream
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
+from stad_lab.envs.cars import Cars
 from stad_lab.evaluation.evaluate import KIND, evaluate, load_evaluation, report
 from stad_lab.evaluation.statistics import summarise
 from stad_lab.io.files import checksum_of_arrays, copy_file, save_json
@@ -33,7 +34,7 @@ from stad_lab.io.weights import (
     VAE_FILE,
     load_controller,
 )
-from stad_lab.io.workers import run_in_order, single_thread, worker_processes
+from stad_lab.io.workers import run_in_order, worker_threads
 from stad_lab.models.controller import squash
 from stad_lab.replication import tables
 from stad_lab.replication.experiments import (
@@ -116,7 +117,7 @@ def drive_baseline(name: str, folder: Path, executor: Executor | None) -> None:
     if (folder / EVALUATION).exists():
         return
     begin, tracks = time.perf_counter(), list(range(TRACKS))
-    with worker_processes(Config().processes, executor) as executor:
+    with worker_threads(Config().processes, executor) as executor:
         tasks = [(name, track) for track in tracks]
         returns, lengths = zip(*run_in_order(executor, drive_blindly, tasks, name), strict=True)
     found = {"kind": KIND, "variant": name, "renderer": "none"}
@@ -133,26 +134,26 @@ class ConstantDriver:
     def reset(self) -> None:
         """Begin an episode."""
 
-    def act_batch(self, observations: Sequence[np.ndarray]) -> np.ndarray:
+    def act_batch(self, seen: np.ndarray) -> np.ndarray:
         """The action of every car, float32 (cars, 3)."""
         action = squash(np.array([0.0, Config().evolution.initial_gas, 0.0]))
-        return np.tile(action.astype(np.float32), (len(observations), 1))
+        return np.tile(action.astype(np.float32), (len(seen), 1))
 
     def keep(self, cars: np.ndarray) -> None:
         """All cars are alike."""
 
 
 def drive_blindly(name: str, track: int) -> tuple[float, int]:
-    """Drive a track as a baseline driver: (return, frames). Runs in a worker process.
+    """Drive a track as a baseline driver: (return, frames). Runs in a worker.
 
     Rewards do not depend on the renderer, so the fast one serves.
     """
-    single_thread()
     driver = ConstantDriver()
     if name == "random_driver":
         driver = RandomDriver(random_stream("random driver", 0, track))
-    env = make_env(fast=True)
-    episodes = rollout(driver, [env], [env.reset(seed=track)[0]])
+    cars = Cars(1, "frame")
+    cars.reset([track])
+    episodes = rollout(driver, cars)
     return float(episodes.returns[0]), int(episodes.lengths[0])
 
 
