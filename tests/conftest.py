@@ -27,7 +27,7 @@ from filelock import FileLock
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 from stad_lab import Config, load_agent, make_env
-from stad_lab.envs.car_racing import FastCarRacing
+from stad_lab.envs.cars import Cars
 from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controller
 from stad_lab.models.controller import initial_parameters
 
@@ -162,18 +162,18 @@ def observations():
 
 @pytest.fixture(scope="session")
 def noted_tracks():
-    """with noted_tracks() as tracks: the seeds with which cars are set on a track in this process go into the list."""
+    """with noted_tracks() as tracks: the tracks that cars are set on in this process are noted."""
 
     @contextmanager
     def note():
-        tracks, reset = [], FastCarRacing.reset
+        tracks, reset = [], Cars.reset
 
-        def noting(env, *, seed=None, options=None):
-            tracks.append(seed)
-            return reset(env, seed=seed, options=options)
+        def noting(cars, seeds=None, *arguments, **named):
+            tracks.extend(seeds or [])
+            return reset(cars, seeds, *arguments, **named)
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(FastCarRacing, "reset", noting)
+            patch.setattr(Cars, "reset", noting)
             yield tracks
 
     return note

@@ -218,9 +218,9 @@ def test_domain_randomize():
     cars, reference = Cars(1, domain_randomize=True), Reference(domain_randomize=True)
     for seed, options in [(4, None), (None, None), (None, {"randomize": False})]:
         run_episode(reference, cars, DRIVERS["smooth"], seed, 100, options)
-        assert np.array_equal(cars.road_colors[0], reference.world.road_color)
-        assert np.array_equal(cars.background_colors[0], reference.world.bg_color)
-        assert np.array_equal(cars.grass_colors[0], reference.world.grass_color)
+        assert np.array_equal(cars.colors["road"][0], reference.world.road_color)
+        assert np.array_equal(cars.colors["background"][0], reference.world.bg_color)
+        assert np.array_equal(cars.colors["grass"][0], reference.world.grass_color)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.005, 1.0])  # 0.005: more than one tile, less than two
@@ -239,10 +239,10 @@ def test_a_batch_equals_single_cars_on_any_number_of_threads():
 
     def drive(threads):
         cars = Cars(6)
-        parts = [slice(n, n + 6 // threads) for n in range(0, 6, 6 // threads)]
+        parts = np.split(np.arange(6), threads)
 
         def work(part):
-            cars.reset(range(6)[part], range(6)[part])
+            cars.reset(part.tolist(), part.tolist())
             return [cars.step(action[part], part)[0] for action in actions]
 
         with ThreadPoolExecutor(threads) as pool:
