@@ -89,8 +89,6 @@ class WorkerProcesses(Executor):
         return ProcessPoolExecutor(count, mp_context=context, initializer=start_worker)
 
     def _begin(self, task: Future, work: Callable) -> None:
-        if task.cancelled():
-            return
         pool = self.pool
         try:
             attempt = pool.submit(work)
@@ -105,12 +103,15 @@ class WorkerProcesses(Executor):
     ) -> None:
         if attempt.cancelled():
             task.cancel()
-            return
-        error = attempt.exception()
-        if isinstance(error, BrokenProcessPool) and not self.closed and self._replace(pool):
-            self._begin(task, work)
-            return
-        if not task.set_running_or_notify_cancel():
+        error = None if task.cancelled() else attempt.exception()
+        if isinstance(error, BrokenProcessPool) and not self.closed:
+            try:
+                if self._replace(pool):
+                    self._begin(task, work)
+                    return
+            except OSError as failure:  # no process can be started
+                error = failure
+        if not task.set_running_or_notify_cancel():  # tells those who wait for a cancelled task
             return
         if error is None:
             self.losses = 0
