@@ -27,7 +27,7 @@ from pathlib import Path
 import torch
 
 from stad_lab.agent import PRETRAINED, run_folder
-from stad_lab.config import PRESETS, Config, fields_of
+from stad_lab.config import PRESETS, Config, check_same, fields_of
 from stad_lab.io.files import copy_file, load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
@@ -196,7 +196,7 @@ def run_stages(
                     raise
                 if did:
                     note()
-            print(f"{name}: {'done' if did else 'already there, nothing to do'}")
+            print(f"{name}: {'done' if did else 'already there, nothing to do'}", flush=True)
             worked |= did
         record["budget"] = budget(config, folder, data)
         save_json(folder / RECORD, record)
@@ -240,7 +240,10 @@ def open_record(config: Config, folder: Path, before: dict | None) -> dict:
     if not path.exists():
         earlier = {} if before is None else {"earlier": before}
         return {**new, "made_with": made, "seconds": {}, **earlier}
-    record = load_json(path, kind="record") | new
+    record = load_json(path, kind="record")
+    if (folder / VAE_FILE).exists():  # then its part of the configuration has not changed
+        check_same(path, record["config"], {n: new["config"][n] for n in ("variant", "seed", "vae")})
+    record |= new
     if made != starts(record)[-1]:
         record["continued_with"] = [*starts(record)[1:], made]
     return record
