@@ -289,8 +289,8 @@ def load_agent(source: str | Path) -> Agent:
             f"{str(source)!r} is no trained agent: expected {', '.join(shipped_agents())}, or the"
             " folder of a finished run of `python -m stad_lab train`"
         )
-    world_model = load_world_model(folder)
     parameters, metadata = load_controller(folder / CONTROLLER_FILE)
+    world_model = load_world_model(folder)
     agent = Agent(world_model, parameters)
     check_belongs(folder / CONTROLLER_FILE, metadata, **world_model.checksums)
     return agent

@@ -239,8 +239,8 @@ def evaluate(
     other += f"-{episodes}-tracks" * (episodes != 100)
     file = json or result_folder(agent) / f"evaluation-{run_folder(agent).name}{other}.json"
     load_agent(agent)
-    check_output(file)
     check_writable(file)
+    check_output(file)
     unfinished = file.with_name(f"unfinished-{file.name}")
     with cluster_of(scheduler) as executor:
         result = evaluate(agent, episodes, first_track, fast, processes, executor, unfinished)
@@ -331,8 +331,8 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
 
     file = json or result_folder(run) / f"probe-{run_folder(run).name}.json"
     load_world_model(run_folder(run))
-    check_output(file)
     check_writable(file)
+    check_output(file)
     found = probe_run(run, episodes, processes)
     print(describe_probe(found), flush=True)
     save_json(file, found)

@@ -156,10 +156,15 @@ def test_every_field_has_a_sentence_of_help(kind):
             assert following.endswith('."""'), field.name
 
 
-def test_another_value_is_refused_and_one_that_did_not_exist_counts_as_equal(tmp_path):
-    check_same(tmp_path, {"vae": {"stride": 4}}, {"vae": {"stride": 4, "later": 1}, "more": 0})
-    with pytest.raises(ValueError, match=r"made with vae\.stride=4, now vae\.stride=2 is asked"):
-        check_same(tmp_path, {"vae": {"stride": 4}}, {"vae": {"stride": 2}})
+def test_another_value_is_refused_and_one_that_did_not_exist_counts_as_its_default(tmp_path):
+    older = {"seed": 0, "vae": {"stride": 4}}
+    check_same(tmp_path, older, {"vae": {"stride": 4, "free_bits": 0.0}})
+    for now, message in (
+        ({"vae": {"stride": 2}}, r"made with vae\.stride=4, now vae\.stride=2 is asked"),
+        ({"vae": {"free_bits": 0.5}}, r"made with vae\.free_bits=0\.0, now vae\.free_bits=0\.5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            check_same(tmp_path, older, now)
 
 
 def test_random_streams_do_not_collide():
