@@ -81,7 +81,7 @@ class Agent:
         frames = np.stack([to_frame(observation, crop_bar) for observation in observations])
         if self.state is None:
             self.cars = np.arange(len(frames))
-            zeros = torch.zeros(1, len(frames), self.mdn_rnn.hidden_size)
+            zeros = torch.zeros(1, len(frames), self.mdn_rnn.hidden_size, dtype=torch.float32)
             self.state = (zeros, zeros.clone())
         frame, difference = map(to_tensor, to_pictures(frames, self.memory.push(frames)))
         self.latents = self.vae.encode(frame, difference)[0].numpy()

@@ -318,6 +318,23 @@ def random_stream(purpose: str, seed: int, *numbers: int) -> np.random.Generator
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
 
+# A track is named by the seed of `env.reset`. The uses never share one: an agent is evaluated on
+# tracks that nothing was trained or chosen on, and V and M on tracks that they have not seen.
+TRACK_RANGES = {
+    "test": (0, 1_000_000),
+    "collect": (1_000_000, 2_000_000),
+    "evolve": (2_000_000, 3_000_000),
+    "validate": (3_000_000, 4_000_000),
+    "inspect": (4_000_000, 5_000_000),
+}
+
+
+def track_seeds(use: str, count: int, seed: int = 0, *numbers: int) -> list[int]:
+    """Seeds of `count` tracks from the range of one use, drawn with a seed and further numbers."""
+    rng = random_stream("tracks", seed, list(TRACK_RANGES).index(use), *numbers)
+    return rng.integers(*TRACK_RANGES[use], count).tolist()
+
+
 PRESETS = {
     # The whole pipeline in under a minute: shows that everything works, teaches the car nothing.
     "quick": Config(

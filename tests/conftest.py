@@ -1,20 +1,17 @@
-"""What the tests share: small settings, one real run of the real command line, and a road-following test driver."""
+"""What the tests share: a quick preset, one real run of the real command line, and its agent."""
 
 import os
 
-os.environ.setdefault("STAD_LAB_SETTINGS", "quick")
-os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")  # a GPU does not repeat its sums bit for bit
-os.environ.setdefault(
-    "SDL_VIDEODRIVER", "dummy"
-)  # check_env tries render_mode="human": no window may open
-os.environ.setdefault(
-    "OMP_NUM_THREADS", "1"
-)  # in kernels and commands too: the cores are shared by several tests
-os.environ.setdefault(
-    "TQDM_MININTERVAL", "1"
-)  # a kernel's messages that nobody has read yet are dropped after 1,000
+os.environ.setdefault("STAD_LAB_PRESET", "quick")
+# A GPU does not repeat its sums bit for bit.
+os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
+# check_env tries render_mode="human": no window may open.
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+# Several tests share the cores, with the kernels and commands that they start.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+# A kernel drops messages that nobody has read after 1,000.
+os.environ.setdefault("TQDM_MININTERVAL", "1")
 
-import functools
 import json
 import shutil
 import subprocess
@@ -29,17 +26,12 @@ import torch
 from filelock import FileLock
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
-from stad_lab import load_agent, make_env
-from stad_lab.agent import drive, load_controller
-from stad_lab.config import Settings
+from stad_lab import Config, load_agent, make_env
 from stad_lab.envs.car_racing import FastCarRacing
-from stad_lab.evaluation.evaluate import evaluate
-from stad_lab.io.files import save_tensors
+from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controller
 from stad_lab.models.controller import initial_parameters
 
-torch.set_num_threads(
-    1
-)  # the models here are tiny: more threads would only get in each other's way
+torch.set_num_threads(1)  # the models here are tiny
 
 
 def run_stad_lab(*arguments, **environment):
@@ -124,9 +116,8 @@ def train_quickly(folder, guard):
         guard
     )  # a PyTorch that has trained in this process hands its own on
     begin = time.perf_counter()
-    process = run_stad_lab(
-        "train", "--variant", "input_output", "--settings", "quick", "--out", folder, **guarded
-    )
+    command = ("train", "quick", "--variant", "input_output", "--out", folder)
+    process = run_stad_lab(*command, **guarded)
     told = {name: getattr(process, name) for name in ("returncode", "stdout", "stderr")}
     return told | {"seconds": time.perf_counter() - begin}
 
@@ -141,23 +132,20 @@ def quick_run(quick_training):
 def straight_run(quick_run, tmp_path_factory):
     """The run with a C whose sight reaches the gas alone: it goes straight on, and off the field in some 300 frames."""
     folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("runs") / "straight")
-    _, facts = load_controller(folder / "controller.safetensors", "input_output")
-    quick = Settings.preset("quick")
-    straight = initial_parameters(
-        quick.latent_size, quick.hidden_size, gas=-0.2
-    )  # 0.4, were the driver blind
+    _, metadata = load_controller(folder / CONTROLLER_FILE)
+    quick = Config.preset("quick")
+    straight = initial_parameters(quick.vae.latent_size, quick.mdn_rnn.hidden_size, gas=-0.2)
     gas = straight[:-3].reshape(3, -1)[1]
     gas[:] = 0.02 * np.random.default_rng(0).standard_normal(gas.shape)
-    save_tensors(
-        folder / "controller.safetensors", {"parameters": torch.from_numpy(straight)}, **facts
-    )
+    metadata.pop("kind")
+    save_controller(folder / CONTROLLER_FILE, straight, **metadata)
     return folder
 
 
 @pytest.fixture
 def agent(quick_run):
     """The agent of the run."""
-    return load_agent("input_output", quick_run)
+    return load_agent(quick_run)
 
 
 @pytest.fixture(scope="session")
@@ -189,20 +177,6 @@ def noted_tracks():
             yield tracks
 
     return note
-
-
-@pytest.fixture(scope="session")
-def evaluate_briefly():
-    """evaluate_briefly(patch): a row of the table is evaluated on one track, with the fast renderer, for 60 frames."""
-
-    def shorten(patch):
-        patch.setattr("stad_lab.replication.run.TRACKS", 1)
-        patch.setattr("stad_lab.replication.run.evaluate", functools.partial(evaluate, fast=True))
-        patch.setattr(
-            "stad_lab.training.evolution.drive", functools.partial(drive, max_frames=60)
-        )  # a search says its own
-
-    return shorten
 
 
 @pytest.fixture

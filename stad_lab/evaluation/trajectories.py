@@ -1,26 +1,27 @@
-"""Drives: episodes kept whole, with the true motion of the car beside what it shows, and what V and M make of them.
+"""Trajectories: recorded episodes with the true motion of the car, and what V and M make of them.
 
-Training sees frames and actions only. Whoever asks what a latent knows about motion must know the motion: here it is
-read from the simulator. The tracks are from a range of their own ("inspect"), so that V and M have never seen them.
+Training sees frames and actions only. To ask what a latent encodes of the car's motion, one must
+know the motion: here it is read from the simulator. The tracks are from a range of their own,
+"inspect", so that V and M have never seen them.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import gymnasium as gym
 import numpy as np
 import torch
 
-from stad_lab.agent import Agent
-from stad_lab.config import Settings
+from stad_lab.agent import Agent, Driver, encode_episode, remember_episode, rollout
+from stad_lab.config import Config
 from stad_lab.envs.car_racing import TRACK_WIDTH, make_env
 from stad_lab.envs.frames import episode_differences, to_frame
-from stad_lab.models.mdn_rnn import MDNRNN, Mixture, encode_frames
-from stad_lab.models.vae import AutoEncoder, to_array, to_uint8
-from stad_lab.training.dataset import begin_randomly
+from stad_lab.io.weights import WorldModel
+from stad_lab.models.mdn_rnn import Mixture
+from stad_lab.models.vae import VAE, to_array, to_uint8
+from stad_lab.training.dataset import random_start
 
 FRAMES_A_SECOND = 50  # of CarRacing's physics
-MOTION = {  # the columns of `Drive.motion`, with their units
+MOTION = {  # the columns of `Trajectory.motion`, with their units
     "forward speed": "world units per second",
     "slip speed": "world units per second, to the right",
     "yaw rate": "radians per second, to the left",
@@ -31,15 +32,15 @@ MOTION = {  # the columns of `Drive.motion`, with their units
 
 
 @dataclass(frozen=True)
-class Drive:
-    """One episode, T frames long; row t of each array belongs to the moment at which `observations[t]` is seen."""
+class Trajectory:
+    """One episode of T frames; row t of each array belongs to `observations[t]`."""
 
     observations: np.ndarray
     """uint8 (T, 96, 96, 3)."""
     actions: np.ndarray
-    """float32 (T, 3): what the driver did on seeing the observation."""
+    """float32 (T, 3): the action on that observation."""
     rewards: np.ndarray
-    """float32 (T,): what that action earned."""
+    """float32 (T,): the reward of that action."""
     motion: np.ndarray
     """float32 (T, 6): the columns are the keys of MOTION."""
 
@@ -47,36 +48,49 @@ class Drive:
         return len(self.actions)
 
     def frames(self, crop_bar: bool) -> np.ndarray:
-        """What V sees of it: uint8 (T, 64, 64, 3). Whether without the indicator bar, is as V was trained."""
+        """What V sees: uint8 (T, 64, 64, 3), without the indicator bar or with it."""
         return np.array([to_frame(observation, crop_bar) for observation in self.observations])
 
 
+class Recorder:
+    """Keeps what a trajectory needs, as `observe` of `rollout`."""
+
+    def __init__(self):
+        self.rows: list[tuple] = []
+
+    def __call__(self, _: int, env: gym.Env, observation: np.ndarray, action: np.ndarray) -> None:
+        """Keep one moment."""
+        self.rows.append((observation, action, true_motion(env)))
+
+    def trajectory(self, rewards: list[float]) -> Trajectory:
+        """The trajectory so far. ValueError if there is no frame."""
+        if not self.rows:
+            raise ValueError("a trajectory without a frame: drive at least one frame first")
+        observations, actions, motion = map(np.array, zip(*self.rows, strict=True))
+        return Trajectory(observations, actions, np.array(rewards, np.float32), motion)
+
+
 def true_motion(env: gym.Env) -> np.ndarray:
-    """How the car moves and where it is on the road, from the simulator: float32 (6,), as MOTION names them."""
-    car_racing = env.unwrapped
-    hull, track = (
-        car_racing.car.hull,
-        np.array(car_racing.track),
-    )  # of a tile: progress, direction, x, y
+    """The car's motion and its place on the road, from the simulator: float32 (6,), see MOTION."""
+    racing = env.unwrapped
+    hull, track = racing.car.hull, np.array(racing.track)  # of a tile: progress, direction, x, y
     along, across = (
         np.dot(hull.linearVelocity, hull.GetWorldVector(axis)) for axis in ((0, 1), (1, 0))
     )
-    _, direction, x, y = track[
-        np.hypot(track[:, 2] - hull.position.x, track[:, 3] - hull.position.y).argmin()
-    ]
+    distances = np.hypot(track[:, 2] - hull.position.x, track[:, 3] - hull.position.y)
+    _, direction, x, y = track[distances.argmin()]
     offset = (hull.position.x - x) * np.cos(direction) + (hull.position.y - y) * np.sin(direction)
     turned = (hull.angle - direction + np.pi) % (2 * np.pi) - np.pi
-    wheel_angle = car_racing.car.wheels[0].joint.angle
-    return np.array(
-        [along, across, hull.angularVelocity, wheel_angle, offset / TRACK_WIDTH, turned], np.float32
-    )
+    wheel = racing.car.wheels[0].joint.angle
+    motion = [along, across, hull.angularVelocity, wheel, offset / TRACK_WIDTH, turned]
+    return np.array(motion, np.float32)
 
 
 def driven_path(motion: np.ndarray) -> np.ndarray:
-    """Where the car went, by dead reckoning: float32 (T, 6) -> world units (T, 2), from (0, 0), first heading upward.
+    """The car's path by dead reckoning: float32 (T, 6) -> world units (T, 2) from (0, 0).
 
-    The speeds along and across the car are turned by the heading, which is the sum of the yaw rates, and summed: what a
-    car without a map knows of its own way. (Between two frames lie 1/50 seconds.)
+    The car first heads upward. The speeds along and across it are turned by the sum of the yaw
+    rates, and summed.
     """
     forward, slip, yaw_rate = motion[:, :3].astype(float).T / FRAMES_A_SECOND
     heading = np.cumsum(yaw_rate) - yaw_rate
@@ -86,115 +100,78 @@ def driven_path(motion: np.ndarray) -> np.ndarray:
 
 
 def road_in_sight(motion: np.ndarray) -> np.ndarray:
-    """Whether the car is within 3 half road widths of the centre line and heads along the road: bool (T,).
+    """Whether the car is within 3 half road widths of the centre and heads along: bool (T,).
 
-    Elsewhere a picture of grass is all there is, and no latent could tell where the road went.
+    Elsewhere the picture shows only grass, and no latent could encode where the road is.
     """
     names = list(MOTION)
-    offset, turned = motion[:, names.index("road offset")], motion[:, names.index("heading error")]
+    offset = motion[:, names.index("road offset")]
+    turned = motion[:, names.index("heading error")]
     return (np.abs(offset) < 3) & (np.abs(turned) < np.pi / 2)
 
 
-def record(
-    env: gym.Env, observation: np.ndarray, act: Callable[[np.ndarray], np.ndarray], frames: int
-) -> Drive:
-    """Drive on from `observation` for at most so many frames, and close the environment.
-
-    Args:
-        act: observation -> action, float32 (3,).
-    """
-    rows, ended = [], False
-    while len(rows) < frames and not ended:
-        motion, action = true_motion(env), act(observation)
-        following, reward, terminated, truncated, _ = env.step(action)
-        rows.append((observation, action, reward, motion))
-        observation, ended = following, terminated or truncated
-    env.close()
-    return to_drive(rows)
+def record(driver: Driver, env: gym.Env, observation: np.ndarray, frames: int) -> Trajectory:
+    """Drive on from `observation`, for at most so many frames, and close the environment."""
+    recorder = Recorder()
+    episodes = rollout(driver, [env], [observation], max_frames=frames, observe=recorder)
+    return recorder.trajectory(episodes.rewards[0])
 
 
-def to_drive(rows: list[tuple]) -> Drive:
-    """Rows (observation, action, reward, motion), one for each frame, as a Drive. ValueError if there are none."""
-    if not rows:
-        raise ValueError("a drive without a frame: drive at least one frame before you look at it")
-    observations, actions, rewards, motion = zip(*rows, strict=True)
-    return Drive(
-        np.array(observations), np.array(actions), np.array(rewards, np.float32), np.array(motion)
-    )
+def record_random_trajectory(config: Config, index: int) -> Trajectory:
+    """An episode of the random driver as in the dataset, but on a track kept for inspection."""
+    env, observation, driver = random_start(config, index, use="inspect")
+    return record(driver, env, observation, config.data.episode_frames)
 
 
-def record_random_drive(settings: Settings, index: int) -> Drive:
-    """A drive of the random driver, as `rollouts.drive_randomly` makes them, but on a track kept for inspection."""
-    env, observation, driver = begin_randomly(settings, index, use="inspect")
-    return record(env, observation, lambda _: driver.act(), settings.episode_frames)
-
-
-def record_drive(agent: Agent, track: int, frames: int) -> Drive:
-    """A drive of an agent from the start of a track, at most `frames` long."""
+def record_trajectory(agent: Agent, track: int, frames: int) -> Trajectory:
+    """An episode of an agent from the start of a track, at most `frames` long."""
     env = make_env()
-    observation, _ = env.reset(
-        seed=int(track)
-    )  # one that NumPy has chosen is NumPy's, which Gymnasium refuses
-    agent.reset()
-    return record(env, observation, agent.act, frames)
+    observation, _ = env.reset(seed=int(track))
+    return record(agent, env, observation, frames)
 
 
 @dataclass(frozen=True)
-class Inside:
-    """What V and M make of a drive of T frames."""
+class Inspection:
+    """What V and M make of a trajectory of T frames."""
 
     frames: np.ndarray
     """What V saw: uint8 (T, 64, 64, 3)."""
     differences: np.ndarray
     """The difference images: float32 (T, 64, 64, 3) in [-1, 1]."""
-    drawn_frames: np.ndarray
-    """The frames that V redraws from mu: uint8 (T, 64, 64, 3)."""
-    drawn_differences: np.ndarray | None
-    """The differences that V redraws: float32 (T, 64, 64, 3); None if its variant does not."""
+    frame_reconstructions: np.ndarray
+    """The frames decoded from mu: uint8 (T, 64, 64, 3)."""
+    difference_reconstructions: np.ndarray | None
+    """float32 (T, 64, 64, 3); None if the variant does not reconstruct them."""
     mu: np.ndarray
     """Means of z: float32 (T, latent_size)."""
     hidden: np.ndarray
-    """M's memory before it sees the frame, which C is shown with z: float32 (T, hidden_size)."""
+    """M's memory before the frame, which C sees with z: float32 (T, hidden_size)."""
     mixture: Mixture
-    """What M expects after the frame and the action: parts (1, T, latent_size, mixtures)."""
+    """M's prediction after the frame and the action: parts (1, T, latent_size, mixtures)."""
 
 
-def encode_drive(
-    autoencoder: AutoEncoder, drive: Drive, stride: int, crop_bar: bool
+def encode_trajectory(
+    vae: VAE, trajectory: Trajectory, stride: int, crop_bar: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What V makes of a drive: mu and logvar of z, float32 (T, latent_size) each; stride and bar as V was trained."""
-    return tuple(encode_frames(autoencoder, drive.frames(crop_bar), stride))
+    """V's mu and logvar, float32 (T, latent_size) each; stride and bar as V was trained."""
+    return tuple(encode_episode(vae, trajectory.frames(crop_bar), stride))
 
 
 @torch.no_grad()
-def remember_drive(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """M's memory before every frame of a drive: mu (T, latent_size), actions (T, 3) -> float32 (T, hidden_size)."""
-    return memory_before(remember_frames(mdn_rnn, latents, actions))
-
-
-def remember_frames(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> torch.Tensor:
-    """M's memory after every frame of a drive: float32 (1, T, hidden_size)."""
-    return mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None], None)[
-        0
-    ]
-
-
-def memory_before(after: torch.Tensor) -> np.ndarray:
-    """M's memory before every frame, float32 (T, hidden_size), from that after it; before the first it is empty."""
-    return torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)[0].numpy()
-
-
-@torch.no_grad()
-def look_inside(
-    autoencoder: AutoEncoder, mdn_rnn: MDNRNN, drive: Drive, stride: int, crop_bar: bool
-) -> Inside:
-    """Show V and M a drive from its first frame on, and keep all they make of it; stride and bar as V was trained."""
-    frames = drive.frames(crop_bar)
-    mu, _ = encode_frames(autoencoder, frames, stride)
-    after = remember_frames(mdn_rnn, mu, drive.actions)
-    hidden, mixture = memory_before(after), mdn_rnn.mixture(after)
-    drawn, changed = autoencoder.decode(torch.from_numpy(mu))
-    changed = None if changed is None else to_array(changed)
-    return Inside(
-        frames, episode_differences(frames, stride), to_uint8(drawn), changed, mu, hidden, mixture
+def inspect_trajectory(world_model: WorldModel, trajectory: Trajectory) -> Inspection:
+    """Show V and M a trajectory from its first frame on, and keep all that they make of it."""
+    vae, mdn_rnn, stride = world_model.vae, world_model.mdn_rnn, world_model.stride
+    frames = trajectory.frames(world_model.crop_bar)
+    mu, _ = encode_episode(vae, frames, stride)
+    z, actions = torch.from_numpy(mu), torch.from_numpy(trajectory.actions)
+    mixture, _ = mdn_rnn(z[None], actions[None])
+    decoded, changed = vae.decode(z)
+    return Inspection(
+        frames=frames,
+        differences=episode_differences(frames, stride),
+        frame_reconstructions=to_uint8(decoded),
+        difference_reconstructions=None if changed is None else to_array(changed),
+        mu=mu,
+        hidden=remember_episode(mdn_rnn, mu, trajectory.actions),
+        mixture=mixture,
     )

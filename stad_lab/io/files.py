@@ -1,8 +1,8 @@
-"""Files that survive: atomic, durable writes, reads that notice every changed bit, and one owner for a folder.
+"""Files that survive: atomic writes, reads that notice every changed bit, and locked folders.
 
-Weights are safetensors, everything else is JSON; nothing that is read can run code. A file is written under another
-name, flushed to the disk and then renamed, so a reader sees the old version or the new one, never half of one. Every
-file carries a checksum of what it says, and is not used if that has changed.
+Weights are safetensors, everything else is JSON; nothing that is read can run code. A file is
+written under another name, flushed to the disk and then renamed, so that a reader sees the old
+version or the new one. Every file carries a checksum of its content.
 """
 
 import errno
@@ -10,32 +10,32 @@ import hashlib
 import json
 import os
 import re
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import torch
 from filelock import FileLock, Timeout
 from safetensors.torch import load, save
 
-KIND = "stad_lab"
+METADATA = "stad_lab"  # the entry of a safetensors header that holds our metadata
 CHECKSUM = "checksum"
-PATIENCE = (
-    1.0 if os.name == "nt" else 0.0
-)  # seconds: on Windows a virus scanner may hold a file for a moment
+PATIENCE = 1.0 if os.name == "nt" else 0.0  # seconds that a virus scanner may hold a file
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Own a folder for a `with` block; makes it if it is missing, and clears away what a killed process left half-done.
+    """Own a folder for a `with` block; it is made if missing, and cleared of half-written files.
 
-    The operating system frees the lock when the process ends, however it ends. A process may lock a folder repeatedly.
+    The operating system frees the lock when the process ends. A process may lock it repeatedly.
 
     Raises:
-        OSError: another process works in the folder, or nobody may write there.
+        OSError: another process works in the folder, or it cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -43,7 +43,7 @@ def locked(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout:
         raise BlockingIOError(
-            f"{folder} is in use by another process: wait until that has ended, or choose another folder"
+            f"{folder} is in use by another process: wait for it, or choose another folder"
         ) from None
     except OSError as error:
         raise OSError(
@@ -51,9 +51,8 @@ def locked(folder: Path) -> Iterator[None]:
         ) from error
     try:
         for file in folder.glob(".*.part"):
-            if (ours := re.fullmatch(r"\..+\.(\d+)\.part", file.name)) and not psutil.pid_exists(
-                int(ours[1])
-            ):
+            ours = re.search(r"\.(\d+)\.[^.]*\.part$", file.name)
+            if ours and not psutil.pid_exists(int(ours[1])):
                 file.unlink(missing_ok=True)
         yield
     finally:
@@ -61,25 +60,38 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that a crash or a power cut at any moment leaves the old version or the new one.
+    """Write a file so that a crash at any moment leaves the old version or the new one.
 
     Raises:
-        OSError: the disk is full or not to be written; the old version is still there.
+        OSError: it cannot be written; the old version is still there.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as file:
+        # A random name, opened exclusively: nobody can have put a link there.
+        prefix = f".{path.name}.{os.getpid()}."
+        opened, name = tempfile.mkstemp(".part", prefix, path.parent)
+        temporary = Path(name)
+        with os.fdopen(opened, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
+        temporary.chmod(0o666 & ~current_umask())
         replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        if temporary:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+
+
+def current_umask() -> int:
+    """The permissions that new files of this process do not get."""
+    umask = os.umask(0)
+    os.umask(umask)
+    return umask
 
 
 def replace(temporary: Path, path: Path) -> None:
@@ -96,21 +108,21 @@ def replace(temporary: Path, path: Path) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> OSError:
-    """The error for a file that the system does not let us write."""
+    """The error for a file that cannot be written."""
     return OSError(
-        f"{path} could not be written ({error.strerror}): see to free room and to the right to write there; what was in"
-        " it before is unchanged"
+        f"{path} could not be written ({error.strerror}): check the free space and the right to"
+        " write there; what was in it before is unchanged"
     )
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a rename in the folder last through a power cut, where the system can (not on Windows and some shares)."""
+    """Make a rename survive a power cut, where the system can (not on Windows)."""
     if os.name != "nt":
         opened = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(opened)
         except OSError as error:
-            if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # as on some network shares
                 raise
         finally:
             os.close(opened)
@@ -120,15 +132,12 @@ def check_writable(path: Path) -> None:
     """Raise OSError, before any work, if the file `path` could not be written at its end."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder: give the name of a file")
-    if (
-        path.exists() and not path.is_file()
-    ):  # a device, which a file would take the place of for everybody
+    if path.exists() and not path.is_file():  # a device, for example
         raise OSError(f"{path} is no ordinary file: give the name of a file")
-    trial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        trial.touch()
-        trial.unlink()
+        with tempfile.NamedTemporaryFile(dir=path.parent):
+            pass
     except OSError as error:
         raise unwritable(path, error) from error
 
@@ -147,16 +156,13 @@ def read_bytes(path: Path, remedy: str) -> bytes:
         raise FileNotFoundError(f"{path} does not exist{where}: {remedy}") from None
     except OSError as error:
         raise OSError(
-            f"{path} cannot be read ({error.strerror}): make it readable, or move it away and {remedy}"
+            f"{path} cannot be read ({error.strerror}): make it readable, or move it away and"
+            f" {remedy}"
         ) from error
 
 
 def copy_file(source: Path, folder: Path) -> None:
-    """Copy a file into a folder under its own name, so that a kill at any moment leaves all of it or nothing.
-
-    Raises:
-        OSError: it cannot be read or written.
-    """
+    """Copy a file into a folder under its own name, atomically."""
     write_bytes(folder / source.name, read_bytes(source, "make it again"))
 
 
@@ -171,10 +177,8 @@ def save_json(path: Path, value: dict) -> None:
     Each entry has a line, and so has each element of a list of dicts.
     """
     value = {name: part for name, part in value.items() if name != CHECKSUM}
-    lines = [
-        f"{json.dumps(name)}: {layout(part)}"
-        for name, part in (value | {CHECKSUM: checksum_of_json(value)}).items()
-    ]
+    whole = value | {CHECKSUM: checksum_of_json(value)}
+    lines = [f"{json.dumps(name)}: {layout(part)}" for name, part in whole.items()]
     write_bytes(path, ("{\n" + ",\n".join(lines) + "\n}\n").encode())
 
 
@@ -190,13 +194,16 @@ def checksum_of_json(value: Any) -> str:
     return checksum(json.dumps(json.loads(json.dumps(value))).encode())
 
 
-def load_json(path: Path, remedy: str = "make it again") -> dict:
+def load_json(path: Path, remedy: str = "make it again", kind: str | None = None) -> dict:
     """Read what `save_json` wrote.
+
+    Args:
+        kind: that the file's entry "kind" must have, if it has one.
 
     Raises:
         FileNotFoundError: no such file; the message carries the remedy.
         OSError: it cannot be read.
-        ValueError: the file is damaged, or was changed by hand.
+        ValueError: the file is damaged, was changed by hand, or is of another kind.
     """
     content = read_bytes(path, remedy)
     try:
@@ -205,7 +212,9 @@ def load_json(path: Path, remedy: str = "make it again") -> dict:
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
     if checksum_of_json(value) != wanted:
-        raise damaged(path, "it does not say what its checksum was made of", remedy)
+        raise damaged(path, "its content is not that of its checksum", remedy)
+    if kind and value.get("kind", kind) != kind:
+        raise ValueError(f"{path} is of kind {value['kind']!r}: expected {kind!r}")
     return value
 
 
@@ -215,21 +224,27 @@ def damaged(path: Path, reason: str, remedy: str) -> ValueError:
 
 
 def save_tensors(path: Path, tensors: dict[str, torch.Tensor], **metadata) -> None:
-    """Write tensors as safetensors, atomically, with `metadata` (anything JSON can say) and a checksum in its header."""
+    """Write tensors as safetensors, atomically, with metadata (JSON) and a checksum."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    # In one entry: safetensors writes several in any order, and the same content should be the same bytes.
-    said = json.dumps(metadata | {CHECKSUM: checksum_of_tensors(tensors, json.dumps(metadata))})
-    write_bytes(path, save(tensors, metadata={KIND: said}))
+    # One entry: safetensors writes several in any order, and equal content should be equal bytes.
+    found = checksum_of_tensors(tensors, json.dumps(metadata))
+    said = json.dumps(metadata | {CHECKSUM: found})
+    write_bytes(path, save(tensors, metadata={METADATA: said}))
 
 
 def checksum_of_tensors(tensors: dict[str, torch.Tensor], said: str = "") -> str:
-    """SHA-256 of names, types, shapes and values of tensors, and of what else is said about them."""
+    """SHA-256 of names, types, shapes and values of tensors, and of their metadata."""
     found = hashlib.sha256(said.encode())
     for name in sorted(tensors):
         tensor = tensors[name].detach().cpu().contiguous()
         found.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         found.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return found.hexdigest()
+
+
+def checksum_of_arrays(**arrays: np.ndarray) -> str:
+    """`checksum_of_tensors` of NumPy arrays."""
+    return checksum_of_tensors({name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
 def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, torch.Tensor], dict]:
@@ -244,21 +259,21 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     try:
         tensors = load(content)
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        metadata = json.loads(header.get("__metadata__", {}).get(KIND, "null"))
-    except Exception as error:  # the parser meets bytes of any kind, and has many ways to say so
+        metadata = json.loads(header.get("__metadata__", {}).get(METADATA, "null"))
+    except Exception as error:  # the parser meets bytes of any kind, and raises many errors
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
     if not isinstance(metadata, dict):
         raise ValueError(
-            f"{path} was not written by stad_lab: give a file that `python -m stad_lab train` made"
+            f"{path} was not written by stad_lab: give a file of `python -m stad_lab train`"
         )
     wanted = metadata.pop(CHECKSUM, None)
     if checksum_of_tensors(tensors, json.dumps(metadata)) != wanted:
-        raise damaged(path, "it does not hold what its checksum was made of", remedy)
+        raise damaged(path, "its content is not that of its checksum", remedy)
     return tensors, metadata
 
 
 def load_into(module: torch.nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    """Put tensors into a module; nothing is changed unless every name, shape and value fits.
+    """Put tensors into a module as float32, if every name and shape fits and all is finite.
 
     Raises:
         ValueError: names or shapes that differ, or weights that are not finite.
@@ -273,11 +288,9 @@ def load_into(module: torch.nn.Module, tensors: dict[str, torch.Tensor], path: P
             found = tuple(tensors[name].shape) if name in tensors else "nothing"
             wanted = tuple(expected[name].shape) if name in expected else "nothing"
             raise ValueError(
-                f"{path} holds {found} for {name!r} where {type(module).__name__} with these settings has {wanted}:"
-                " the weights belong to another variant or size"
+                f"{path} holds {found} for {name!r}, {type(module).__name__} of these settings has"
+                f" {wanted}: the weights belong to another variant or size"
             )
         if not torch.isfinite(tensors[name]).all():
-            raise ValueError(
-                f"{path} holds values that are not finite in {name!r}: train this part again"
-            )
-    module.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+            raise ValueError(f"{path} holds values that are not finite in {name!r}: train it again")
+    module.float().load_state_dict({name: tensor.float() for name, tensor in tensors.items()})

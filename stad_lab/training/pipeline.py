@@ -1,319 +1,327 @@
-"""From an empty folder to a trained agent: the four stages in order, each resumable, and the record of the run.
+"""From an empty folder to a trained agent: four stages in order, each resumable, and a record.
 
 The folder of a run::
 
-    rollouts/                     the random driver's episodes, in a second round the earlier agent's too
-    autoencoder.safetensors       V
-    mdn_rnn.safetensors           M
-    evolution.json                every generation of CMA-ES
-    controller.safetensors        C: the average of the last CMA means, when it drove the validation tracks best
-    components.safetensors        where C is searched, with `Settings.components`
-    start.safetensors             only in a second round or a finish: the earlier run's C, for the V and M here
-    record.json                   variant, settings, versions, commit, and the time (in seconds) and the budget of every
-                                  stage, and the most memory that a process has held by its end (in MB, for each start);
-                                  a start that was killed, or that a full disk or a refused file ended, leaves no
-                                  trace in it
+    dataset/                  the random driver's episodes, in a second iteration an agent's too
+    vae.safetensors           V
+    mdn_rnn.safetensors       M
+    evolution.json            every generation of CMA-ES
+    controller.safetensors    C: the averaged mean of CMA-ES with the best validation
+    components.safetensors    where C is searched, with `evolution.components`
+    start.safetensors         the first C, in a second iteration or a fine-tuning
+    record.json               configuration, versions, machine, time and budget of each stage
 """
 
+import contextlib
 import importlib.metadata
-import itertools
 import os
 import platform
 import shlex
 import subprocess
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
 
 import torch
 
-from stad_lab.agent import CONTROLLER, PRETRAINED
-from stad_lab.config import Settings, check_same_run
+from stad_lab.agent import PRETRAINED, run_folder
+from stad_lab.config import PRESETS, Config, fields_of
 from stad_lab.io.files import copy_file, load_json, load_tensors, locked, save_json, save_tensors
-from stad_lab.io.workers import peak_memory, refuse_in_starting_worker, worker_processes
-from stad_lab.models.mdn_rnn import train_mdn_rnn
-from stad_lab.models.vae import check_variant, load_autoencoder, train_autoencoder
-from stad_lab.training.dataset import COLLECT_SETTINGS, MANIFEST, collect_rollouts
-from stad_lab.training.evolution import LOG, evolve
+from stad_lab.io.weights import (
+    CONTROLLER_FILE,
+    MDN_RNN_FILE,
+    VAE_FILE,
+    load_vae,
+    load_world_model,
+)
+from stad_lab.io.workers import check_script, worker_processes
+from stad_lab.training.dataset import (
+    MANIFEST,
+    Dataset,
+    check_seen,
+    collect,
+    made_with,
+    read_manifest,
+)
+from stad_lab.training.evolution import LOG, evolve, read_log
+from stad_lab.training.mdn_rnn import check_mdn_rnn, train_mdn_rnn
 from stad_lab.training.second_iteration import (
     carry_over,
     check_earlier_agent,
     collect_again,
     order_of_episodes,
 )
-from stad_lab.training.subspace import COMPONENTS, START, find_components
+from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE, find_components
 from stad_lab.training.trainer import training_device
+from stad_lab.training.vae import check_vae, train_vae
 
-STAGES = ("rollouts", "autoencoder", "mdn_rnn", "controller")
+STAGES = ("dataset", "vae", "mdn_rnn", "controller")
+RECORD = "record.json"
+WEIGHTS = (VAE_FILE, MDN_RNN_FILE, START_FILE, COMPONENTS_FILE, CONTROLLER_FILE)
+RUN_FILES = (*WEIGHTS, LOG, RECORD, MANIFEST)
 PACKAGES = (
-    "torch",
-    "numpy",
-    "gymnasium",
-    "box2d",
-    "pygame-ce",
-    "cma",
-    "opencv-python-headless",
+    "torch", "numpy", "gymnasium", "box2d", "pygame-ce", "cma", "opencv-python-headless",
     "safetensors",
-)
+)  # fmt: skip
 MACHINE = ("python", "platform", "processor", "cores", "trained_on")
-WEIGHTS = ("autoencoder.safetensors", "mdn_rnn.safetensors", START, COMPONENTS, CONTROLLER)
 GIVE_A_RUN = "give the folder of a run, as `python -m stad_lab train --out` makes it"
+HEARTBEAT = 30.0  # seconds, after which the record says how long a stage has taken so far
+
+Stage = Callable[[Executor], bool]
+"""Does what is missing; returns False if nothing was."""
 
 
 def train(
-    variant: str,
-    settings: Settings,
+    config: Config,
     folder: str | Path,
-    rollouts_folder: str | Path | None = None,
+    dataset_folder: str | Path | None = None,
     until: str = "controller",
     executor: Executor | None = None,
     earlier: str | Path | None = None,
 ) -> bool:
-    """Run every stage up to `until` that is not finished in `folder`; run it again after an interrupt to go on.
+    """Run every stage up to `until` that is not finished in `folder`; call it again to continue.
 
     Args:
-        variant: "frame", "input", "output" or "input_output".
         folder: of the run; made if missing.
-        rollouts_folder: where the rollouts are, or go; None for `folder/rollouts`. Runs may share one.
-        until: the last stage to run.
-        executor: who drives; None for `settings.processes` processes of this machine.
-        earlier: folder of the run whose agent drives `settings.agent_episodes` for the rollouts, and whose C is carried
-            over (see `second_round`); None in a first round.
+        dataset_folder: where the dataset is, or goes; None for `folder/dataset`.
+        until: the last stage, one of STAGES.
+        executor: who drives; None for `config.processes` processes of this machine.
+        earlier: in a second iteration, the folder of the run whose agent drives
+            `data.agent_episodes` for the dataset, and whose C is carried over.
 
     Returns:
-        False if everything was finished already and nothing was done.
+        False if everything was finished already.
 
     Raises:
-        ValueError: an unknown variant or stage, a folder with a run of another variant or other settings, or with a
-            file that is damaged or belongs to another run, or an earlier run whose V has seen the bar otherwise, whose
-            V, M and C do not belong together, that is not at its end, or that is not as it was when this second round
-            began.
+        ValueError: a wrong argument, or a file in the folder that is damaged or of another run.
         OSError: another process works in the folder, or a file cannot be read or written.
         TaskError, FloatingPointError: as raised by the stages.
     """
-    refuse_in_starting_worker()
-    check_variant(variant)
+    check_script()
     if until not in STAGES:
         raise ValueError(f"unknown stage {until!r}: choose one of {', '.join(STAGES)}")
-    if (settings.agent_episodes > 0) != (earlier is not None):
+    if (config.data.agent_episodes > 0) != (earlier is not None):
         raise ValueError(
-            f"agent_episodes={settings.agent_episodes} and earlier={earlier}: a second round needs both, the number of"
-            " episodes and the folder of the run whose agent drives them; a first round has neither"
+            f"data.agent_episodes={config.data.agent_episodes} and earlier={earlier}: a second"
+            " iteration needs both, the number of episodes and the run whose agent drives them"
         )
+    folder = Path(folder)
+    data = folder / "dataset" if dataset_folder is None else Path(dataset_folder)
     before = None
     if earlier is not None:
         before = read_finished(Path(earlier))
-        check_earlier_agent(variant, settings, Path(earlier))
-    folder = Path(folder)
-    rollouts_folder = folder / "rollouts" if rollouts_folder is None else Path(rollouts_folder)
-    stages = {
-        "rollouts": lambda pool: collect_rollouts(settings, rollouts_folder, pool),
-        "autoencoder": lambda _: train_autoencoder(variant, settings, rollouts_folder, folder),
-        "mdn_rnn": lambda _: train_mdn_rnn(variant, settings, rollouts_folder, folder),
-        "controller": lambda pool: (
-            find_components(variant, settings, rollouts_folder, folder)
-            | evolve(variant, settings, folder, pool)
-        ),
+        check_earlier_agent(config, Path(earlier))
+    check_stages(config, folder, data)
+    stages = make_stages(config, folder, data, None if earlier is None else Path(earlier))
+    wanted = {name: stages[name] for name in STAGES[: STAGES.index(until) + 1]}
+    return run_stages(wanted, config, folder, data, executor, before)
+
+
+def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) -> dict[str, Stage]:
+    """The four stages as functions of the executor that drives."""
+    opened = []
+
+    def dataset() -> Dataset:
+        """The dataset, which is read and checked once for all stages."""
+        if not opened:
+            opened.append(Dataset(data))
+        return opened[0]
+
+    def collect_stage(pool: Executor) -> bool:
+        return (
+            collect_again(config, earlier, data, pool) if earlier else collect(config, data, pool)
+        )
+
+    def controller_stage(pool: Executor) -> bool:
+        did = earlier is not None and carry_over(config, earlier, dataset, folder)
+        did |= find_components(config, dataset, folder)
+        return did | evolve(config, folder, pool)
+
+    return {
+        "dataset": collect_stage,
+        "vae": lambda _: train_vae(config, dataset, folder),
+        "mdn_rnn": lambda _: train_mdn_rnn(config, dataset, folder),
+        "controller": controller_stage,
     }
-    if earlier is not None:
-        again = (variant, settings, Path(earlier), rollouts_folder)
-        stages["rollouts"] = lambda pool: collect_again(*again, pool)
-        search = stages["controller"]
-        stages["controller"] = lambda pool: carry_over(*again, folder) | search(pool)
-    with locked(folder):
-        record = open_record(folder, variant, settings, command_of(variant, settings), before)
-        return run_stages(
-            stages, STAGES[: STAGES.index(until) + 1], record, folder, rollouts_folder, executor
+
+
+def check_stages(config: Config, folder: Path, data: Path) -> None:
+    """Raise ValueError, before any work, if a finished stage in the folder is of another run."""
+    refuse_first_edition(folder)
+    if not config.data.agent_episodes:
+        read_manifest(data, made_with(config))
+    if (folder / VAE_FILE).exists():
+        seen = check_vae(config, None, folder)["dataset"]
+        check_seen(folder / VAE_FILE, seen, data)
+    if (folder / MDN_RNN_FILE).exists():
+        check_mdn_rnn(config, folder)
+        if (folder / LOG).exists():
+            read_log(config, folder, load_world_model(folder))
+
+
+def refuse_first_edition(folder: Path) -> None:
+    """Raise ValueError if a folder holds a run of stad_lab 0.1."""
+    path = folder / RECORD
+    if path.exists() and "settings" in load_json(path):
+        raise ValueError(
+            f"{folder} holds a run of stad_lab 0.1: continue it with that version, or choose"
+            " another folder"
         )
 
 
 def run_stages(
-    stages: dict[str, Callable[[Executor], bool]],
-    wanted: Sequence[str],
-    record: dict,
+    stages: dict[str, Stage],
+    config: Config,
     folder: Path,
-    rollouts_folder: Path | None,
+    data: Path | None,
     executor: Executor | None,
+    before: dict | None,
 ) -> bool:
-    """Run the wanted stages in order and keep the record of them; False if there was nothing to do."""
+    """Run some stages in order and keep the record of the run; False if nothing was to do."""
     worked = False
-    for stage in wanted:
-        begin, did, pool = time.perf_counter(), True, None  # an interrupted stage has worked too
-        try:
-            with worker_processes(record["settings"]["processes"], executor) as pool:
-                did = stages[stage](pool)
-        except (ValueError, OSError):  # refused: what is in the folder stays as it is
-            did = False
-            raise
-        finally:
-            if did:
-                record["seconds"][stage] = (
-                    record["seconds"].get(stage, 0.0) + time.perf_counter() - begin
-                )
-                record.setdefault("peak_memory", {}).setdefault(stage, []).append(peak_memory(pool))
-                save_json(folder / "record.json", record)
-        print(f"{stage}: {'done' if did else 'already there, nothing to do'}")
-        worked |= did
-    spent = budget(Settings.from_dict(record["settings"]), folder, rollouts_folder)
-    if worked or spent != record.get(
-        "budget"
-    ):  # a kill may have come between the last generation and this line
-        record["budget"] = spent
-        save_json(folder / "record.json", record)
+    with locked(folder):
+        record = open_record(config, folder, before)
+        for name, stage in stages.items():
+            did = True  # an interrupted stage has worked, too
+            with timed(record, name, folder):
+                try:
+                    with worker_processes(config.processes, executor) as pool:
+                        did = stage(pool)
+                except (ValueError, OSError):  # refused: nothing was done
+                    did = False
+                    raise
+                finally:
+                    record["worked"] = did
+            print(f"{name}: {'done' if did else 'already there, nothing to do'}")
+            worked |= did
+        record.pop("worked", None)
+        record["budget"] = budget(config, folder, data)
+        save_json(folder / RECORD, record)
     return worked
 
 
+@contextlib.contextmanager
+def timed(record: dict, stage: str, folder: Path) -> Iterator[None]:
+    """Add the time of a `with` block to the record; written while it runs, in case of a kill."""
+    before, begin, ended = record["seconds"].get(stage), time.perf_counter(), threading.Event()
+
+    def note() -> None:
+        record["seconds"][stage] = (before or 0.0) + time.perf_counter() - begin
+        save_json(folder / RECORD, {k: v for k, v in record.items() if k != "worked"})
+
+    def beat() -> None:
+        while not ended.wait(HEARTBEAT):
+            note()
+
+    watch = threading.Thread(target=beat, daemon=True)
+    watch.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        watch.join()
+        if record.pop("worked", True):
+            note()
+
+
+def open_record(config: Config, folder: Path, before: dict | None) -> dict:
+    """The record of the run in `folder`, or a new one.
+
+    "made_with" is that of the first start; a later one on another machine or with other versions
+    is added to "continued_with". "earlier" is the record of the run that this one continues.
+    """
+    path, made = folder / RECORD, provenance(command_of(config))
+    new = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
+    if not path.exists():
+        earlier = {} if before is None else {"earlier": before}
+        return {**new, "made_with": made, "seconds": {}, **earlier}
+    record = load_json(path, kind="record") | new
+    if made != starts(record)[-1]:
+        record["continued_with"] = [*starts(record)[1:], made]
+    return record
+
+
+def starts(record: dict) -> list[dict]:
+    """What a run was made with, and all that it was continued with."""
+    return [record["made_with"], *record.get("continued_with", [])]
+
+
 def read_finished(earlier: Path) -> dict:
-    """The record of a run, whose search for C must be at its end.
+    """The record of a run whose CMA-ES has finished.
 
     Raises:
-        ValueError: it is not, or a file is damaged.
-        FileNotFoundError: there is no run, or no log of a search.
+        ValueError: it has not, or a file is damaged.
+        FileNotFoundError: there is no run, or no log.
     """
-    record = load_json(earlier / "record.json", GIVE_A_RUN)
+    refuse_first_edition(earlier)
+    record = load_json(earlier / RECORD, GIVE_A_RUN)
     log = load_json(earlier / LOG, GIVE_A_RUN)
-    done, asked = (
-        len(log["generations"]),
-        log["settings"]["generations"],
-    )  # of a longer run the log knows first
-    if (
-        done != asked
-        or record.get("budget", {}).get("agents") != asked * record["settings"]["population"]
-    ):
+    done, asked = len(log["generations"]), log["evolution"]["generations"]
+    if done != asked:
         raise ValueError(
-            f"the search in {earlier} is not at its end, with {done} of {asked} generations: run its own command to the"
-            " end first"
+            f"CMA-ES in {earlier} is not finished, with {done} of {asked} generations: run its own"
+            " command to the end first"
         )
     return record
 
 
-def open_record(
-    folder: Path, variant: str, settings: Settings, command: str, before: dict | None = None
-) -> dict:
-    """The record of the run in `folder`, or a new one.
-
-    Args:
-        before: the record of the run that a second round, or a finish, goes on from; this one's holds it.
-
-    What it was "made_with" stays that of the first start; a later one by other means adds to "continued_with".
-
-    Raises:
-        ValueError: the folder holds a run of another variant or of other settings, or one that went on from another
-            run, or from the same when it was less far.
-    """
-    path = folder / "record.json"
-    if not path.exists() or is_empty_run(folder):
-        record = {
-            "variant": variant,
-            "settings": settings.as_dict(),
-            "made_with": provenance(command),
-            "seconds": {},
-        }
-        if before is not None:
-            record["earlier"] = before
-        save_json(path, record)
-        return record
-    record = load_json(path)
-    if "settings" not in record:
-        raise ValueError(
-            f"{folder} holds the record of {record['variant']}, which is no run: choose another folder"
-        )
-    check_same_run(
-        path,
-        {"variant": record["variant"], **record["settings"]},
-        {"variant": variant, **settings.as_dict()},
-    )
-    if what_counts(record.get("earlier")) != what_counts(before):
-        raise ValueError(
-            f"{folder} holds a run that does not go on from the one given as it is now: choose another folder, or give"
-            " the run that it goes on from"
-        )
-    made = provenance(command)
-    if made != starts(record)[-1]:
-        record["continued_with"] = [*starts(record)[1:], made]
-    return record | {"settings": settings.as_dict()}
+def command_of(config: Config) -> str:
+    """The command line that makes a run of this configuration."""
+    changed = {
+        name: changes(config, Config.preset(name, variant=config.variant)) for name in PRESETS
+    }
+    name = min(changed, key=lambda name: len(changed[name]))
+    options = [f"--{option} {shlex.quote(str(value))}" for option, value in changed[name].items()]
+    command = f"python -m stad_lab train {name} --variant {config.variant} --out ..."
+    earlier = ["--earlier ..."] if config.data.agent_episodes else []
+    return " ".join([command, *options, *earlier])
 
 
-def is_empty_run(folder: Path) -> bool:
-    """Whether a folder holds nothing but the record of a run that was refused before it made anything."""
-    files = (file for file in folder.rglob("*") if file.is_file() and not file.name.startswith("."))
-    found = [file.name for file in itertools.islice(files, 2)]
-    return found == ["record.json"] and load_json(folder / "record.json").get("seconds") == {}
-
-
-def what_counts(record: dict | None) -> dict | None:
-    """What a later run owes to the run of a record: not how long its stages took, and not on which machine."""
-    if record is None:
-        return None
-    settings = Settings.from_dict(record["settings"]).as_dict()
+def changes(config: Config, usual: Config) -> dict:
+    """Dotted command-line names and values of the fields that differ from `usual`."""
+    before = {name: value for name, _, value in fields_of(usual)}
     return {
-        "variant": record["variant"],
-        "settings": {
-            name: value for name, value in settings.items() if name not in ("name", "processes")
-        },
-        "budget": record.get("budget"),
-        "earlier": what_counts(record.get("earlier")),
+        name.replace("_", "-"): value
+        for name, _, value in fields_of(config)
+        if value != before[name]
     }
 
 
-def starts(record: dict) -> list[dict]:
-    """What a run was made with, and all that it was continued with, the last start at the end."""
-    return [record["made_with"], *record.get("continued_with", [])]
-
-
-def command_of(variant: str, settings: Settings) -> str:
-    """The command line that makes a run of these settings again."""
-    command = f"python -m stad_lab train --variant {variant} --settings {settings.name} --out ..."
-    changes = set_options(settings, Settings.preset(settings.name))
-    return command + changes + (" --earlier ..." if settings.agent_episodes else "")
-
-
-def set_options(settings: Settings, usual: Settings) -> str:
-    """What a command line says to have these settings instead of the usual ones: " --set NAME=VALUE" of each change."""
-    before = usual.as_dict()
-    changed = [
-        f"{name}={value}" for name, value in settings.as_dict().items() if value != before[name]
-    ]
-    return "".join(f" --set {shlex.quote(change)}" for change in changed)
-
-
 def provenance(command: str) -> dict:
-    """What a run was made with: versions, machine, command, and the commit if the code lies in a git checkout."""
-    changes = git("status", "--porcelain", "--untracked-files=no", "--", ".")
+    """What a result was made with: versions, machine, command, and the commit of a checkout."""
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".")
     return {
         "python": platform.python_version(),
         **{package: importlib.metadata.version(package) for package in PACKAGES},
         "platform": f"{platform.system()} {platform.machine()}",
         "processor": processor(),
         "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),  # V's and M's last bits depend on them
+        "threads": torch.get_num_threads(),  # the last bits of V and M depend on them
         "trained_on": str(training_device()),
         "commit": git("rev-parse", "HEAD"),
-        "uncommitted_changes": changes if changes is None else bool(changes),
+        "uncommitted_changes": changed if changed is None else bool(changed),
         "command": command,
     }
 
 
 def processor() -> str:
-    """The processor's name, as far as the system tells it, and the instructions that PyTorch uses of it.
+    """The processor's name, as far as it is known, and the instructions that PyTorch uses.
 
-    On another one the last bits of a sum may differ, and with them a whole drive.
+    On another one the last bits of a sum may differ, and with them a whole episode.
     """
     listed = Path("/proc/cpuinfo")
-    name = (
-        listed.read_text().partition("model name")[2].partition("\n")[0] if listed.exists() else ""
-    )
-    return f"{name.strip(chr(9) + ' :') or platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
+    text = listed.read_text() if listed.exists() else ""
+    name = text.partition("model name")[2].partition("\n")[0].strip("\t :")
+    return f"{name or platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
 
 
 def git(*arguments: str) -> str | None:
-    """What git says about this checkout; None without git, or if this file is not in a checkout.
-
-    An environment may lie in the checkout of something else, which does not track what is installed in it.
-    """
+    """What git says about this checkout; None without git or if this file is not in a checkout."""
     here = Path(__file__)
     try:
+        # An environment may lie in the checkout of something else, which does not track this file.
         for command in (["ls-files", "--error-unmatch", here.name], arguments):
             found = subprocess.run(
                 ["git", "-C", str(here.parent), *command],
@@ -326,85 +334,79 @@ def git(*arguments: str) -> str | None:
         return None
 
 
-def budget(settings: Settings, folder: Path, rollouts_folder: Path | None) -> dict:
-    """Every logged episode and frame that was driven for this run, by what it was driven for.
+def budget(config: Config, folder: Path, data: Path | None) -> dict:
+    """All agents, episodes and frames that were driven for this run, by their purpose.
 
-    What an earlier run has cost is in that run's record, which lies in this one's: `total_budget` adds it. A finish
-    has no rollouts of its own.
+    Those of an earlier run are in its own record; `total_budget` adds them.
     """
     spent = {"random": {"episodes": 0, "frames": 0}}
-    numbers = order_of_episodes(settings) if settings.agent_episodes else range(settings.episodes)
-    for block in load_json(rollouts_folder / MANIFEST)["blocks"] if rollouts_folder else ():
-        driver = "random" if numbers[block["index"]] < settings.episodes else "agent_driver"
-        one = spent.setdefault(driver, {"episodes": 0, "frames": 0})
-        one["episodes"] += 1
-        one["frames"] += block["frames"]
+    count = config.data.episodes
+    order = order_of_episodes(config) if config.data.agent_episodes else range(count)
+    for entry in load_json(data / MANIFEST)["episodes"] if data else ():
+        driver = "random" if order[entry["index"]] < count else "agent_driver"
+        add(spent, driver, 1, entry["frames"])
     if (folder / LOG).exists():
-        log = load_json(folder / LOG)["generations"]
-        validations = [entry["validation"] for entry in log if "validation" in entry]
-        spent["agents"] = sum(len(entry["returns"]) for entry in log)
-        spent["evolution"] = {
-            "episodes": sum(len(returns) for entry in log for returns in entry["returns"]),
-            "frames": sum(entry["frames"] for entry in log),
-        }
-        spent["validation"] = {
-            "episodes": sum(len(validation["returns"]) for validation in validations),
-            "frames": sum(validation["frames"] for validation in validations),
-        }
+        generations = load_json(folder / LOG)["generations"]
+        spent["agents"] = sum(len(entry["returns"]) for entry in generations)
+        for entry in generations:
+            add(spent, "evolution", sum(map(len, entry["returns"])), entry["frames"])
+            if "validation" in entry:
+                validation = entry["validation"]
+                add(spent, "validation", len(validation["returns"]), validation["frames"])
     return spent
 
 
-def total_budget(record: dict) -> dict:
-    """Agents, episodes and frames that a run has cost, with those of the earlier run that it was built on.
+def add(spent: dict, purpose: str, episodes: int, frames: int) -> None:
+    """Add episodes and frames to those of a purpose."""
+    one = spent.setdefault(purpose, {"episodes": 0, "frames": 0})
+    one["episodes"] += episodes
+    one["frames"] += frames
 
-    The random driver's episodes of a second round are those of the first, made again instead of kept: they count once.
+
+def total_budget(record: dict) -> dict[str, int]:
+    """Agents, episodes and frames of a run, with those of the earlier run that it is built on.
+
+    The random driver's episodes of a second iteration are those of the first and count once.
     """
     parts = [part for part in record["budget"].values() if isinstance(part, dict)]
     total = {unit: sum(part[unit] for part in parts) for unit in ("episodes", "frames")}
     total["agents"] = record["budget"].get("agents", 0)
     if "earlier" in record:
         before = total_budget(record["earlier"])
-        again = all(
-            record["settings"][field] == record["earlier"]["settings"][field]
-            for field in COLLECT_SETTINGS
-        )
-        made_again = record["budget"]["random"] if again else {}
-        total = {
-            unit: count + before[unit] - made_again.get(unit, 0) for unit, count in total.items()
-        }
+        random = [made_with(Config.from_dict(one["config"])) for one in (record, record["earlier"])]
+        for one in random:
+            one["data"] = {k: v for k, v in one["data"].items() if not k.startswith("agent_")}
+        again = record["budget"]["random"] if random[0] == random[1] else {}
+        total = {unit: n + before[unit] - again.get(unit, 0) for unit, n in total.items()}
     return total
 
 
-def ship(variant: str, folder: str | Path, target: Path = PRETRAINED) -> Path:
-    """Copy what a run has trained into `stad_lab/pretrained/`: records as they are, V and M in half precision.
+def ship(folder: str | Path, name: str) -> Path:
+    """Copy a run into `stad_lab/pretrained/NAME`: V, M and C in half precision, and its record.
 
-    Half precision keeps a clone of the repository small. Evaluate the shipped agent after this, not the run. A second
-    round, or a finish, goes into a folder `second_round` of its own; returns the new folder. All other files
-    there with an ending, of an agent that was shipped before, are removed, its evaluation too.
+    Evaluate the shipped agent after this, not the run. Returns the new folder; what an agent of
+    that name left there is removed.
 
     Raises:
         FileNotFoundError: the run has no V.
-        ValueError: the run is damaged, of another variant, or the shipped agent itself.
+        ValueError: the run is damaged, or is the shipped agent itself.
     """
-    folder = Path(folder)
-    load_autoencoder(folder / "autoencoder.safetensors", variant)
-    target = target / "second_round" / variant if (folder / START).exists() else target / variant
-    if target.resolve() == folder.resolve():
-        raise ValueError(f"{folder} is where agents are shipped to: give the folder of a run")
-    shipped = [name for name in (*WEIGHTS, "record.json", LOG) if (folder / name).exists()]
-    read = {
-        name: load_tensors(folder / name) for name in shipped if name in WEIGHTS
-    }  # all, before any is written
-    for name, (tensors, facts) in read.items():
+    folder, target = Path(folder), PRETRAINED / name
+    load_vae(folder / VAE_FILE)
+    if target.resolve() == folder.resolve() or not name.isidentifier():
+        raise ValueError(f"name={name!r}, folder={folder}: expected a new name and another folder")
+    shipped = [one for one in (*WEIGHTS, RECORD, LOG) if (folder / one).exists()]
+    read = {one: load_tensors(folder / one) for one in shipped if one in WEIGHTS}  # all, then write
+    for one, (tensors, metadata) in read.items():
         small = {
             key: value.half() if value.dtype == torch.float32 else value
             for key, value in tensors.items()
         }
-        save_tensors(target / name, small, **facts)
-    for name in shipped:
-        if name not in read:
-            copy_file(folder / name, target)
-    for file in target.glob("*.*"):
-        if file.is_file() and file.name not in shipped:
+        save_tensors(target / one, small, **metadata)
+    for one in shipped:
+        if one not in read:
+            copy_file(folder / one, target)
+    for file in run_folder(target).glob("*.*"):
+        if file.is_file() and file.name not in shipped and file.suffix != ".md":
             file.unlink()
     return target

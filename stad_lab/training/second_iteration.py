@@ -1,208 +1,192 @@
-"""A second round: the first agent drives, V and M learn from what it sees, and what C knows goes over to them.
+"""A second iteration of the world model: V and M learn from what the first agent sees.
 
-The random driver is soon on the grass. So the first V and M have hardly seen the road at speed, which is nearly all
-that their agent sees later. In a second round that agent drives for the data, beside the random driver, and V and M
-are trained anew on both. A new V has other latents, and the old C is lost on them. But its outputs on the recorded
-drives are known, so a ridge regression finds the C that gives the same outputs from the new z and h, and evolution goes
-on from there. That costs no episode. (World Models, section 5, proposes such rounds for harder tasks.)
-
-V draws its batches from all frames alike, M its sequences from all episodes alike: of these the agent's, which are
-long, are only about one in ten.
+The random driver soon leaves the road, so the first V and M have hardly seen the road at speed,
+which is nearly all that their agent sees. In a second iteration that agent drives for the dataset,
+beside the random driver, and V and M are retrained on both. The new V has other latents, on which
+the old C is useless. But the old C's outputs on the recorded episodes are known, so a ridge
+regression finds the C with the same outputs on the new z and h, and evolution starts there. This
+costs no episode. (World Models, section 5, proposes such iterations for harder tasks.)
 """
 
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
-import torch
 
-from stad_lab.agent import (
-    CONTROLLER,
-    Agent,
-    WorldModel,
-    load_agent,
-    load_controller,
-    read_world_model,
-)
-from stad_lab.config import Settings
+from stad_lab.agent import Agent, features_of, load_agent
+from stad_lab.config import Config, random_stream, track_seeds
 from stad_lab.envs.car_racing import make_env
-from stad_lab.envs.frames import to_frame
-from stad_lab.io.files import checksum
-from stad_lab.io.workers import work_alone, worker_processes
+from stad_lab.io.files import checksum_of_arrays
+from stad_lab.io.weights import (
+    CONTROLLER_FILE,
+    WorldModel,
+    load_controller,
+    load_world_model,
+)
+from stad_lab.io.workers import single_thread, worker_processes
 from stad_lab.models.controller import seen_columns, unpack
-from stad_lab.models.mdn_rnn import ACTION_SIZE
 from stad_lab.training.dataset import (
-    AGENT_SETTINGS,
-    COLLECT_SETTINGS,
-    Rollouts,
-    collect,
+    Dataset,
+    Episode,
+    collect_episodes,
     drive_randomly,
-    track_seeds,
+    made_with,
+    record_frames,
 )
 from stad_lab.training.evolution import hand_out, make_agent
-from stad_lab.training.subspace import START, features, load_start, save_start, sizes
+from stad_lab.training.ridge import fit_ridge
+from stad_lab.training.subspace import START_FILE, load_start, save_start
 
-NOISE = 0.1  # of a frame's steering and gas; it wanders like the random driver's hand, so that many moments differ
-LIMIT = 2.5  # of C's outputs before squashing, as targets: tanh(2.5) = 0.987, and what lies beyond makes no difference
+NOISE = 0.1  # mean standard deviation of the noise on steering and gas, in a frame
+LIMIT = 2.5  # of C's outputs before squashing, as targets: tanh(2.5) is 0.987
 PENALTY = 0.01  # of the ridge regression, for each frame
 
 
 def collect_again(
-    variant: str, settings: Settings, earlier: Path, folder: Path, executor: Executor | None = None
+    config: Config, earlier: Path, folder: Path, executor: Executor | None = None
 ) -> bool:
-    """Collect a dataset of both drivers into `folder`; goes on where an earlier call stopped.
+    """Collect a dataset of both drivers into `folder`, or what is missing of it.
 
-    The random driver's episodes are those of a first round with the same settings; the agent's are mixed among them.
+    The random driver's episodes are those of a first iteration with the same configuration; the
+    agent's are mixed among them.
 
     Args:
-        earlier: folder of the first run, of the same variant, whose agent drives.
-        executor: who drives; None for `settings.processes` processes of this machine.
+        earlier: folder of the first run, whose agent drives.
+        executor: who drives; None for `config.processes` processes of this machine.
 
-    Returns:
-        False if everything was there already, True if something was collected.
-
-    Raises:
-        ValueError: the folder holds other rollouts, or the first run is damaged.
-        FileNotFoundError: the first run has no agent.
-        OSError, TaskError: as `collect_rollouts`.
+    Returns and raises as `training.dataset.collect`.
     """
-    parameters, _ = load_controller(earlier / CONTROLLER, variant)
-    made_with = {field: getattr(settings, field) for field in (*COLLECT_SETTINGS, *AGENT_SETTINGS)}
-    made_with |= {
-        "variant": variant,
-        "controller_sha256": checksum((earlier / CONTROLLER).read_bytes()),
-    }
-    numbers = order_of_episodes(settings)
+    parameters, _ = load_controller(earlier / CONTROLLER_FILE)
+    agent = {"variant": config.variant, "controller": checksum_of_arrays(parameters=parameters)}
+    order, data = order_of_episodes(config), config.data
     longest = [
-        settings.episode_frames if number < settings.episodes else settings.max_frames
-        for number in numbers
+        data.episode_frames if number < data.episodes else data.agent_frames for number in order
     ]
-    with worker_processes(settings.processes, executor) as executor:
-        source = hand_out(executor, earlier, variant)
-        tasks = [(source, variant, parameters, settings, number) for number in numbers]
-        return collect(folder, made_with, drive_either, tasks, longest, executor)
+    with worker_processes(config.processes, executor) as executor:
+        source = hand_out(executor, earlier)
+        tasks = [(source, parameters, config, number) for number in order]
+        depends_on = {**made_with(config), "agent": agent}
+        return collect_episodes(folder, depends_on, drive_either, tasks, longest, executor)
 
 
-def check_earlier_agent(variant: str, settings: Settings, earlier: Path) -> None:
-    """Raise ValueError unless the earlier V saw the indicator bar as the new one will: the frames are one dataset.
-
-    And unless the earlier V, M and C belong together, as `load_agent` raises.
-    """
-    seen = load_agent(variant, earlier).crop_bar
-    if seen != settings.crop_bar:
+def check_earlier_agent(config: Config, earlier: Path) -> None:
+    """Raise ValueError unless the earlier agent is of this variant and sees the same frames."""
+    world_model = load_agent(Path(earlier)).world_model
+    if world_model.vae.variant != config.variant:
         raise ValueError(
-            f"crop_bar={settings.crop_bar}, but the run in {earlier} has crop_bar={seen}: set that in the second round,"
-            " too, or train a first round anew"
+            f"variant={config.variant!r}, but the run in {earlier} is of"
+            f" {world_model.vae.variant!r}: give a run of the same variant"
+        )
+    if world_model.crop_bar != config.data.crop_bar:
+        raise ValueError(
+            f"data.crop_bar={config.data.crop_bar}, but the run in {earlier} has"
+            f" {world_model.crop_bar}: set the same, or train a first iteration with it"
         )
 
 
-def order_of_episodes(settings: Settings) -> list[int]:
-    """The number of every block's episode, int: 0, 1, ... are the random driver's, those after them the agent's.
+def order_of_episodes(config: Config) -> list[int]:
+    """The episode of every entry in the dataset; from `data.episodes` on they are the agent's.
 
-    They are mixed, because the last blocks of a dataset are held out from training.
+    They are mixed, because the last entries of a dataset are held out from training.
     """
-    rng = np.random.default_rng([settings.seed, 4])
-    return rng.permutation(settings.episodes + settings.agent_episodes).tolist()
+    count = config.data.episodes + config.data.agent_episodes
+    return random_stream("order", config.seed).permutation(count).tolist()
 
 
 def drive_either(
-    source: Path | WorldModel, variant: str, parameters: np.ndarray, settings: Settings, number: int
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Drive episode `number` of a second round, as `drive_randomly` does. Runs in a worker process."""
-    if number < settings.episodes:
-        return drive_randomly(settings, number)
-    work_alone()
-    return drive_noisily(
-        make_agent(source, variant, parameters), settings, number - settings.episodes
-    )
+    source: Path | WorldModel, parameters: np.ndarray, config: Config, number: int
+) -> Episode:
+    """Drive one episode of a second iteration. Runs in a worker process."""
+    if number < config.data.episodes:
+        return drive_randomly(config, number)
+    single_thread()
+    agent = make_agent(source, parameters)
+    return drive_noisily(agent, config, number - config.data.episodes)
 
 
-@torch.inference_mode()
-def drive_noisily(
-    agent: Agent, settings: Settings, index: int
-) -> tuple[np.ndarray, np.ndarray, int]:
-    """Let an agent drive with an unsteady hand: (frames uint8 (T, 64, 64, 3), actions float32 (T, 3), track seed).
+class NoisyDriver:
+    """An agent whose steering and gas are disturbed, so that it meets many situations.
 
-    How unsteady it is differs from episode to episode. M remembers what was done, not what was meant.
+    The strength of the noise differs from episode to episode. M is told what was done.
     """
-    rng = np.random.default_rng([settings.seed, 5, index])
-    track = track_seeds("collect", settings.agent_episodes, settings.seed, 1)[index]
-    unsteadiness, noise, waiting, frames, actions = (
-        rng.uniform(0, 2 * NOISE),
-        np.zeros(2),
-        0,
-        [],
-        [],
-    )
-    env = make_env(fast=True, bar=not settings.crop_bar)
+
+    def __init__(self, agent: Agent, rng: np.random.Generator):
+        self.agent, self.rng = agent, rng
+        self.strength, self.noise = rng.uniform(0, 2 * NOISE), np.zeros(2)
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.agent.reset()
+
+    def act_batch(self, observations: Sequence[np.ndarray]) -> np.ndarray:
+        """The disturbed action of the only car, float32 (1, 3)."""
+        before, actions = self.agent.state, self.agent.act_batch(observations)
+        self.noise = 0.9 * self.noise + self.strength * self.rng.standard_normal(2)
+        actions[:, :2] = np.clip(actions[:, :2] + self.noise, [-1, 0], 1)
+        self.agent.remember(actions, before)
+        return actions
+
+    def keep(self, cars: np.ndarray) -> None:
+        """There is one car."""
+
+
+def drive_noisily(agent: Agent, config: Config, index: int) -> Episode:
+    """Let an agent drive episode `index` with noise."""
+    data = config.data
+    driver = NoisyDriver(agent, random_stream("agent driver", config.seed, index))
+    track = track_seeds("collect", data.agent_episodes, config.seed, 1)[index]
+    env = make_env(fast=True, bar=not data.crop_bar)
     observation, _ = env.reset(seed=track)
-    agent.reset()
-    while len(frames) < settings.max_frames and not (
-        settings.patience and waiting >= settings.patience
-    ):
-        before, action = agent.state, agent.act(observation)
-        noise = 0.9 * noise + unsteadiness * rng.standard_normal(2)
-        action[:2] = np.clip(action[:2] + noise, [-1, 0], 1)
-        agent.take_in(action[None], before)
-        frames.append(to_frame(observation, settings.crop_bar))
-        actions.append(action)
-        observation, reward, terminated, truncated, _ = env.step(action)
-        waiting = 0 if reward > 0 else waiting + 1
-        if terminated or truncated:
-            break
-    env.close()
-    return np.array(frames), np.array(actions), track
+    limits = {"max_frames": data.agent_frames, "patience": data.agent_patience}
+    return *record_frames(driver, env, observation, data.crop_bar, **limits), track
 
 
-def carry_over(
-    variant: str, settings: Settings, earlier: Path, rollouts_folder: Path, folder: Path
-) -> bool:
-    """Find the C that does with the new V and M, in `folder`, what the earlier C does; writes `start.safetensors`.
+def carry_over(config: Config, earlier: Path, dataset: Callable[[], Dataset], folder: Path) -> bool:
+    """Find the C that acts on the new V and M, in `folder`, as the earlier C does on its own.
 
     Returns:
-        False if it was there already.
+        False if START_FILE was there already.
 
     Raises:
-        ValueError, FileNotFoundError: a file of one of the runs, or the rollouts, are damaged or missing.
+        ValueError, FileNotFoundError: a file of one of the runs is damaged or missing.
     """
-    path, new = Path(folder) / START, read_world_model(Path(folder), variant)
+    path, new = Path(folder) / START_FILE, load_world_model(Path(folder))
     if path.exists():
         load_start(path, new)
         return False
-    rollouts, old = Rollouts(rollouts_folder), read_world_model(earlier, variant)
-    parameters, _ = load_controller(earlier / CONTROLLER, variant)
-    wanted, seen = [], []
-    for block, number in enumerate(order_of_episodes(settings)):
-        if number >= settings.episodes:
-            frames, actions = rollouts.frames[block], rollouts.actions[block]
-            wanted.append(outputs(parameters, features(old, frames, actions)))
-            seen.append(features(new, frames, actions))
-    columns = seen_columns(settings.features, *sizes(new))
-    start = fit_controller(
-        np.concatenate(seen), np.clip(np.concatenate(wanted), -LIMIT, LIMIT), columns
-    )
-    save_start(path, start, variant, new)
+    old, (parameters, _) = load_world_model(earlier), load_controller(earlier / CONTROLLER_FILE)
+    wanted, seen, data = [], [], dataset()
+    for entry, number in enumerate(order_of_episodes(config)):
+        if number >= config.data.episodes:
+            episode = data.frames[entry], data.actions[entry]
+            wanted.append(outputs(parameters, features_of(old, *episode)))
+            seen.append(features_of(new, *episode))
+    columns = seen_columns(config.evolution.features, *new.sizes)
+    targets = np.clip(np.concatenate(wanted), -LIMIT, LIMIT)
+    start = fit_controller(np.concatenate(seen), targets, columns)
+    save_start(path, start, config.variant, new)
     return True
 
 
 def outputs(parameters: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """C's three outputs before squashing, (T, 3), for what it sees, (T, features)."""
+    """C's three outputs before squashing (T, 3) for features (T, features)."""
     weights, bias = unpack(parameters)
     return seen @ weights.T + bias
 
 
 def fit_controller(seen: np.ndarray, wanted: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """The C that comes nearest to the wanted outputs (T, 3) from what it sees (T, features): float64 (parameters,).
+    """The C whose outputs come closest to the wanted ones, float64 (parameters,).
 
-    Only the features in `columns`, bool (features,), have weights; the others' are 0.
-
-    Ridge regression: W and b make the mean squared error of W s + b, plus the penalty times the sum of all squared
-    weights, the smallest. Small weights matter more here than the last percent of the fit, since evolution changes all
+    Small weights matter more here than the last percent of the fit, because evolution changes all
     weights by equal steps.
+
+    Args:
+        seen: features (T, features).
+        wanted: outputs before squashing, (T, 3).
+        columns: bool (features,), those that may have weights.
     """
-    middle, target = seen.mean(axis=0, dtype=np.float64), wanted.mean(axis=0)
-    centred = (seen - middle)[:, columns]
-    square = centred.T @ centred + PENALTY * len(seen) * np.eye(columns.sum())
-    weights = np.zeros((ACTION_SIZE, len(columns)))
-    weights[:, columns] = np.linalg.solve(square, centred.T @ (wanted - target)).T
-    return np.concatenate([weights.ravel(), target - weights @ middle])
+    fitted, intercept = fit_ridge(seen[:, columns], wanted, PENALTY * len(seen))
+    weights = np.zeros((wanted.shape[1], len(columns)))
+    weights[:, columns] = fitted.T
+    return np.concatenate([weights.ravel(), intercept])

@@ -1,0 +1,441 @@
+"""The command line, `python -m stad_lab COMMAND`.
+
+Each function below is a command: its arguments are the options, and their descriptions the help.
+What a command needs is imported when it is called, so that `check` runs where PyTorch does not.
+"""
+
+import contextlib
+import functools
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from stad_lab.config import PRESETS, Config
+
+CONTINUES = ("train", "fine-tune", "evaluate", "replicate", "latents")  # after an interrupt
+PROGRAM = "python -m stad_lab"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit status. A user's error ends in one line."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    escape_foreign_letters()
+    command = arguments[0] if arguments else ""
+    try:
+        return parse(arguments)() or 0
+    except KeyboardInterrupt:
+        again = "; the same command continues from there" if command in CONTINUES else ""
+        print(f"\nstopped{again}", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # the reader of our output has gone, as with `| head`
+        return 141
+    except Exception as error:
+        if (message := explain(error)) is None:
+            raise
+        print(f"error: {message}", file=sys.stderr)
+        return 2
+
+
+def parse(arguments: list[str]) -> Callable[[], int | None]:
+    """The command that the arguments ask for, ready to be called.
+
+    tyro calls a command as soon as it has parsed it; this defers it, so that what the parser writes
+    is told from what the command writes. Wrong usage raises ValueError with one line.
+    """
+    preset, arguments = take_preset(arguments)
+    commands = COMMANDS | {"train": training_command(Config.preset(preset))}
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return tyro.extras.subcommand_cli_from_dict(
+                {name: deferred(command) for name, command in commands.items()},
+                prog=PROGRAM,
+                description="Teach a car to drive with a model of its world.",
+                args=arguments,
+                sort_subcommands=False,
+            )
+    except SystemExit as ended:
+        if not ended.code:
+            raise
+        raise ValueError(f"{one_line(told.getvalue())}; see {PROGRAM} --help") from None
+
+
+def deferred(command: Callable) -> Callable:
+    """The command with the same options, which returns a call instead of making it."""
+
+    @functools.wraps(command)
+    def later(*arguments, **named) -> Callable[[], int | None]:
+        return functools.partial(command, *arguments, **named)
+
+    return later
+
+
+def take_preset(arguments: list[str]) -> tuple[str | None, list[str]]:
+    """The preset named after `train`, if there is one, and the other arguments."""
+    if arguments[:1] == ["train"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+        return arguments[1], [arguments[0], *arguments[2:]]
+    return None, arguments
+
+
+def one_line(message: str) -> str:
+    """The parser's message without its frame, and without its advice on --help."""
+    lines = [re.sub(r"[─│╭╮╰╯]+", "", line).strip() for line in message.splitlines()]
+    kept = [line for line in lines if line and line.lower() != "error"]
+    text = " ".join(kept).partition("Argument helptext")[0].partition("For full helptext")[0]
+    return re.sub(
+        r"^(Value error|Parsing error|Unrecognized options|Required options) ", "", text
+    ).strip()
+
+
+def explain(error: Exception) -> str | None:
+    """One line for an error of the user or of the machine; None for a fault of ours."""
+    if isinstance(error, MemoryError | OverflowError) or is_out_of_memory(error):
+        return f"too large for this machine: {error or type(error).__name__}"
+    known = ValueError, OSError, FloatingPointError, ImportError
+    if isinstance(error, known) or type(error).__name__ == "TaskError":
+        return str(error)
+    return None
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether a RuntimeError says that memory is short: PyTorch has no error of its own."""
+    short = ("allocate memory", "could not create a primitive")
+    return isinstance(error, RuntimeError) and any(words in str(error) for words in short)
+
+
+def escape_foreign_letters() -> None:
+    """Print letters that the console does not have, of a folder's name for example, as escapes."""
+    if hasattr(sys.stdout, "reconfigure"):
+        sys.stdout.reconfigure(errors="backslashreplace")
+
+
+@contextlib.contextmanager
+def cluster_of(scheduler: str | None) -> Iterator[Executor | None]:
+    """The executor of a Dask cluster, or None for this machine's own processes."""
+    if scheduler is None:
+        yield None
+        return
+    from stad_lab.io.dask_cluster import cluster
+
+    with cluster(scheduler) as executor:
+        yield executor
+
+
+def output(path: str) -> Path:
+    """A folder or file to write to. ValueError if it is empty, which would mean this folder."""
+    if not path.strip():
+        raise ValueError("--out is empty: give the name of a folder or file, such as runs/input")
+    return Path(path)
+
+
+def check() -> int:
+    """Say whether everything is installed, and what to do about what is not."""
+    from stad_lab.doctor import tell_environment
+
+    return tell_environment()
+
+
+def training_command(config: Config) -> Callable:
+    """The command `train`, with the defaults of a preset."""
+
+    def train(
+        out: str,
+        config: Annotated[Config, tyro.conf.arg(name="")] = config,
+        dataset: str | None = None,
+        earlier: str | None = None,
+        until: Literal["dataset", "vae", "mdn_rnn", "controller"] = "controller",
+        scheduler: str | None = None,
+    ) -> None:
+        """Collect a dataset, train V, train M, evolve C: `train [quick|laptop|paper] --out RUN`.
+
+        Stop it when you like; the same command continues. The preset is that of $STAD_LAB_PRESET,
+        or else laptop, if none is named.
+
+        Args:
+            out: Folder of the run, for example runs/input.
+            config: The configuration.
+            dataset: Folder of the dataset, for runs that share one; OUT/dataset if not given.
+            earlier: For a second iteration: the run whose agent drives and whose C is carried over.
+            until: The last stage to run.
+            scheduler: Address of a Dask scheduler, to drive on a cluster.
+        """
+        from stad_lab.training.pipeline import train
+
+        folder = output(out)
+        with cluster_of(scheduler) as executor:
+            if not train(config, folder, dataset, until, executor, earlier):
+                print(f"everything up to {until} is there in {folder}: nothing to do")
+
+    return train
+
+
+def fine_tune(
+    run: str,
+    out: str,
+    generations: int | None = None,
+    sigma: float | None = None,
+    seed: int | None = None,
+    processes: int = 2,
+    scheduler: str | None = None,
+) -> None:
+    """Continue CMA-ES from a run's C, with several tracks for each agent, against rare failures.
+
+    Stop it when you like; the same command continues.
+
+    Args:
+        run: A shipped agent, or the folder of a finished run.
+        out: Folder of the fine-tuned run.
+        generations: Of CMA-ES, a multiple of 5; 15 if not given.
+        sigma: Initial step size; 0.02 if not given.
+        seed: Of the candidates and tracks; the run's own if not given.
+        processes: Worker processes.
+        scheduler: Address of a Dask scheduler, to drive on a cluster.
+    """
+    from stad_lab.agent import run_folder
+    from stad_lab.training.fine_tuning import fine_tune, fine_tuning_config
+
+    asked = {"generations": generations, "sigma": sigma, "seed": seed}
+    changes = {name: value for name, value in asked.items() if value is not None}
+    earlier, folder = run_folder(run), output(out)
+    config = fine_tuning_config(earlier, evolution=changes, processes=processes)
+    with cluster_of(scheduler) as executor:
+        if not fine_tune(config, earlier, folder, executor):
+            print(f"the fine-tuned run is there in {folder}: nothing to do")
+
+
+def evaluate(
+    agent: str,
+    episodes: int = 100,
+    first_track: int = 0,
+    fast: bool = False,
+    processes: int = 2,
+    json: Path | None = None,
+    scheduler: str | None = None,
+) -> None:
+    """Drive an agent on unseen tracks; prints mean, deviation, interval and share above 900.
+
+    Stop it when you like; the same command continues.
+
+    Args:
+        agent: A shipped agent (frame, input, output, input_output), or the folder of a run.
+        episodes: Number of tracks.
+        first_track: Seed of the first track.
+        fast: Render with the fast renderer instead of Gymnasium's own (not for reports).
+        processes: Worker processes.
+        json: Where to write every episode; by default into the run, or here for a shipped agent.
+        scheduler: Address of a Dask scheduler, to drive on a cluster.
+    """
+    from stad_lab.agent import load_agent, run_folder
+    from stad_lab.evaluation.evaluate import check_output, describe, evaluate
+    from stad_lab.io.files import check_writable, save_json
+
+    other = "-fast" * fast + f"-from-{first_track}" * (first_track != 0)
+    other += f"-{episodes}-tracks" * (episodes != 100)
+    file = json or result_folder(agent) / f"evaluation-{run_folder(agent).name}{other}.json"
+    load_agent(agent)
+    check_output(file)
+    check_writable(file)
+    unfinished = file.with_name(f"unfinished-{file.name}")
+    with cluster_of(scheduler) as executor:
+        result = evaluate(agent, episodes, first_track, fast, processes, executor, unfinished)
+    try:
+        print(describe(result), flush=True)  # first, since the disk may have filled meanwhile
+    finally:  # or the pipe may have been closed, by `head`
+        save_json(file, result)
+        unfinished.unlink(missing_ok=True)
+    print(f"  every episode: {file}")
+
+
+def result_folder(agent: str) -> Path:
+    """Where results of an agent go: into its run, or into this folder for a shipped one."""
+    from stad_lab.agent import PRETRAINED, run_folder
+
+    folder = run_folder(agent)
+    return Path() if folder.parent == PRETRAINED else folder
+
+
+def verify(run: tyro.conf.Positional[str]) -> int:
+    """Check a run's files, and drive three of its recorded episodes again.
+
+    The exit status is 1 if a file has changed, or an episode differs on the machine of the record.
+
+    Args:
+        run: A shipped agent, or the folder of a run.
+    """
+    from stad_lab.agent import run_folder
+    from stad_lab.evaluation.verify import verify
+
+    found = verify(run_folder(run))
+    print("\n".join(f"{name:<14} {outcome}" for name, outcome in found.items()))
+    return int(any(outcome.startswith("FAILED") for outcome in found.values()))
+
+
+def replicate(
+    experiment: str,
+    out: str,
+    seeds: list[int] | None = None,
+    keep: bool = False,
+    scheduler: str | None = None,
+) -> None:
+    """Run one experiment of the replication: V and M, CMA-ES and an evaluation for every seed.
+
+    It says first how long it will take. Stop it when you like; the same command continues.
+
+    Args:
+        experiment: Its name; `claims` lists them.
+        out: Folder of all experiments, for example runs/replication.
+        seeds: Some of the experiment's seeds; all if not given.
+        keep: Only add the finished seeds to the tables of stad_lab/replication/data.
+        scheduler: Address of a Dask scheduler, to drive on a cluster.
+    """
+    from stad_lab.replication import run
+
+    if keep:
+        kept = run.keep(experiment, output(out), seeds)
+        print("\n".join(f"kept {name}" for name in kept) or "no seed is finished")
+        return
+    with cluster_of(scheduler) as executor:
+        print(run.describe_time(experiment, run.time_needed(experiment, seeds)), flush=True)
+        print(run.describe(experiment, run.replicate(experiment, output(out), executor, seeds)))
+
+
+def claims() -> None:
+    """Compute every statistic of the replication from its tables, and write claims.json."""
+    from stad_lab.replication.claims import write_claims
+
+    print(f"written to {write_claims()}")
+
+
+def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None = None) -> None:
+    """Measure what the latents of a run carry of the car's motion, with a linear probe.
+
+    It needs V and M alone, and takes a few minutes.
+
+    Args:
+        run: A shipped agent, or the folder of a run.
+        episodes: Of the random driver; an agent drives a third as many.
+        processes: Worker processes.
+        json: Where to write the result; by default into the run, or here for a shipped agent.
+    """
+    from stad_lab.agent import run_folder
+    from stad_lab.evaluation.evaluate import check_output
+    from stad_lab.io.files import check_writable, save_json
+    from stad_lab.io.weights import load_world_model
+    from stad_lab.replication.latents import describe_probe, probe_run
+
+    file = json or result_folder(run) / f"probe-{run_folder(run).name}.json"
+    load_world_model(run_folder(run))
+    check_output(file)
+    check_writable(file)
+    found = probe_run(run, episodes, processes)
+    print(describe_probe(found), flush=True)
+    save_json(file, found)
+    print(f"  with intervals: {file}")
+
+
+def latents(
+    out: str,
+    preset: Literal["quick", "laptop", "paper"] = "laptop",
+    parts: tuple[Literal["probe", "bar", "vae", "mdn_rnn"], ...] = (),
+    dataset: Path | None = None,
+) -> None:
+    """Measure the shipped V and M, and what they are compared with, on unseen episodes.
+
+    What they are compared with is trained first, which takes an hour or two. Stop it when you like;
+    the same command continues.
+
+    Args:
+        out: Folder for what is trained, and for latents.json.
+        preset: Of what is trained.
+        parts: What to measure; all if not given.
+        dataset: Folder of the dataset; OUT/dataset if not given.
+    """
+    from stad_lab.replication.latents import PARTS, measure
+
+    folder = output(out)
+    measure(Config.preset(preset), dataset or folder / "dataset", folder, list(parts) or PARTS)
+    print(f"every measurement: {folder / 'latents.json'}")
+
+
+def benchmark(
+    parts: tuple[str, ...] = (), rounds: int = 5, json: Path = Path("benchmark.json")
+) -> None:
+    """Measure speeds side by side with Gymnasium and EnvPool, on a machine that does nothing else.
+
+    Args:
+        parts: Some of parity, renderer, loop, training, cluster; all if not given.
+        rounds: How often the contenders take turns.
+        json: Where to write every measurement.
+    """
+    from stad_lab.benchmark import PARTS, benchmark
+    from stad_lab.io.files import check_writable
+
+    check_writable(json)
+    benchmark(list(parts) or list(PARTS), rounds, json)
+    print(f"\nevery measurement: {json}")
+
+
+def ship(run: str, name: str) -> None:
+    """Copy a run's weights and records to stad_lab/pretrained/NAME.
+
+    Args:
+        run: Folder of the run.
+        name: Of the shipped agent.
+    """
+    from stad_lab.training.pipeline import ship
+
+    print(f"shipped to {ship(run, name)}")
+
+
+def film(
+    agent: str,
+    out: str,
+    viewer: bool = False,
+    track: int = 5,
+    first: int = 60,
+    frames: int = 240,
+) -> None:
+    """Make a film of an agent driving: observation, difference image, reconstruction and dream.
+
+    Args:
+        agent: A shipped agent, or the folder of a run.
+        out: The .gif to write; with --viewer it may be a .webp.
+        viewer: Show latents, prediction, action and return, too.
+        track: Seed of the track.
+        first: First frame shown; 60 is after the opening zoom.
+        frames: Frames covered; every third is shown.
+    """
+    from stad_lab.agent import load_agent
+    from stad_lab.io.files import check_writable, write_bytes
+    from stad_lab.viz.video import film_agent, film_viewer
+
+    file, loaded = output(out), load_agent(agent)
+    kind = file.suffix.lstrip(".").lower()
+    if kind not in ("gif", "webp") or (kind == "webp" and not viewer):
+        raise ValueError(f"--out {file}: expected a .gif (or, with --viewer, a .webp)")
+    check_writable(file)
+    shown = (loaded, track, first, frames)
+    write_bytes(file, film_viewer(*shown, kind=kind) if viewer else film_agent(*shown))
+    print(f"filmed to {file}")
+
+
+COMMANDS: dict[str, Callable] = {
+    "check": check,
+    "train": training_command(PRESETS["laptop"]),
+    "fine-tune": fine_tune,
+    "evaluate": evaluate,
+    "verify": verify,
+    "replicate": replicate,
+    "claims": claims,
+    "probe": probe,
+    "latents": latents,
+    "benchmark": benchmark,
+    "ship": ship,
+    "film": film,
+}
