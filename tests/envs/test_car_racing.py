@@ -44,9 +44,9 @@ def wild(env):
 
 
 def drive_both(driver, seed, frames=MAX_FRAMES, pictures=True):
-    """Drive the fast environment, repeat its actions in Gymnasium's: two lists of what `step` returned.
+    """Repeat a drive in Gymnasium's environment: two lists of what `step` returned.
 
-    Without pictures Gymnasium's renderer is left out, which is 98% of its time; its physics stay as they are.
+    Without pictures Gymnasium's renderer is left out, which is 98% of its time.
     """
     steps = []
     fast, official = make_env(fast=True), make_env(fast=False)
