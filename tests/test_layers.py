@@ -70,7 +70,7 @@ def test_no_import_is_relative_and_no_file_can_run_code_that_it_reads(file):
             assert called not in RUNS_CODE
             assert keywords.get("shell", "False") == "False"
             if called == "np.load":
-                assert keywords["allow_pickle"] == "False"
+                assert keywords.get("allow_pickle", "False") == "False"
 
 
 @pytest.mark.parametrize("file", MODELS, ids=name_of)
@@ -83,7 +83,7 @@ def test_the_models_import_nothing_but_torch_and_numpy_and_each_other(file):
 def test_the_controller_loads_neither_torch_nor_pygame():
     loaded = run_python("import sys, stad_lab.models.controller; print(*sys.modules)").split()
     assert "stad_lab.models.controller" in loaded
-    assert not {"torch", "pygame", "gymnasium", "cv2"} & set(loaded)
+    assert not {"torch", "pygame", "cv2", "Box2D"} & set(loaded)
 
 
 def test_the_command_line_loads_torch_only_when_a_command_needs_it():
