@@ -148,8 +148,8 @@ def verify_log(folder: Path, config: Config) -> str:
 
 def verify_controller(folder: Path, config: Config) -> str:
     """Check that C is the one with the best validation in the log, and that this is the best."""
-    if lacks(folder, LOG, CONTROLLER_FILE):
-        return MISSING
+    if not all((folder / name).exists() for name in (LOG, CONTROLLER_FILE)):
+        return MISSING  # but a C that has lost its V or M fails below
     log = read_log(longest(folder, config), folder, load_world_model(folder))
     validated = [entry for entry in log["generations"] if "validation" in entry]
     best = max(validated, key=lambda entry: entry["validation"]["mean"], default=None)
