@@ -199,7 +199,8 @@ def run_stages(
             print(f"{name}: {'done' if did else 'already there, nothing to do'}", flush=True)
             worked |= did
         record["budget"] = budget(config, folder, data)
-        save_json(folder / RECORD, record)
+        if worked or load_json(folder / RECORD) != record:
+            save_json(folder / RECORD, record)
     return worked
 
 
@@ -279,20 +280,24 @@ def command_of(config: Config) -> str:
         name: changes(config, Config.preset(name, variant=config.variant)) for name in PRESETS
     }
     name = min(changed, key=lambda name: len(changed[name]))
-    options = [f"--{option} {shlex.quote(str(value))}" for option, value in changed[name].items()]
+    options = [option_of(*change) for change in changed[name].items()]
     command = f"python -m stad_lab train {name} --variant {config.variant} --out ..."
     earlier = ["--earlier ..."] if config.data.agent_episodes else []
     return " ".join([command, *options, *earlier])
 
 
 def changes(config: Config, usual: Config) -> dict:
-    """Dotted command-line names and values of the fields that differ from `usual`."""
+    """Dotted names and values of the fields that differ from `usual`."""
     before = {name: value for name, _, value in fields_of(usual)}
-    return {
-        name.replace("_", "-"): value
-        for name, _, value in fields_of(config)
-        if value != before[name]
-    }
+    return {name: value for name, _, value in fields_of(config) if value != before[name]}
+
+
+def option_of(name: str, value: object) -> str:
+    """The command-line option that gives a field its value."""
+    stage, dot, field = name.replace("_", "-").rpartition(".")
+    if isinstance(value, bool):
+        return f"--{stage}{dot}{'' if value else 'no-'}{field}"
+    return f"--{stage}{dot}{field} {shlex.quote(str(value))}"
 
 
 def provenance(command: str) -> dict:
