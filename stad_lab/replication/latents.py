@@ -11,10 +11,9 @@ they are compared with is trained in a working folder, on a dataset of its own, 
 """
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -78,7 +77,7 @@ class Encoder(NamedTuple):
     vae: VAE
     stride: int
     crop_bar: bool
-    memories: Mapping[str, MDNRNN] = MappingProxyType({})
+    memories: dict[str, MDNRNN]
 
 
 def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[str]) -> dict:
@@ -142,7 +141,7 @@ def probe_part(study: Study) -> dict:
             encoder = Encoder(model.vae, model.stride, model.crop_bar, memories)
             encoders[f"{prefix}{variant}"] = encoder
     for name, vae in untrained.items():
-        encoders[f"{name}, untrained"] = Encoder(vae, v.stride, config.data.crop_bar)
+        encoders[f"{name}, untrained"] = Encoder(vae, v.stride, config.data.crop_bar, {})
     for stride in STRIDES:
         encoders[f"stride {stride}"] = shorter_encoder(study, stride=stride)
     return {"drivers": probe_all(two_drivers(study.trajectories, config.processes), encoders)}
@@ -237,9 +236,8 @@ def shorter_encoder(study: Study, **change) -> Encoder:
     settings = {"steps": round(SHORTER * usual.steps), **change}
     config = study.config.replace(variant="input_output", vae=settings)
     train(config, folder, study.dataset, until="vae")
-    return Encoder(
-        weights.load_vae(folder / weights.VAE_FILE)[0], config.vae.stride, config.data.crop_bar
-    )
+    vae, _ = weights.load_vae(folder / weights.VAE_FILE)
+    return Encoder(vae, config.vae.stride, config.data.crop_bar, {})
 
 
 def vae_part(study: Study) -> dict:

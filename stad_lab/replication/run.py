@@ -209,7 +209,7 @@ def describe_time(name: str, seeds: Seeds = None) -> str:
         hours = recorded_hours(name, len(experiment.seeds))
         hours += recorded_hours(experiment.base, len(experiment.seeds))
         hours += recorded_hours(experiment.world_model, 0)
-    return f"{name}: about {hours:.1f} hours, as on our two processes, if nothing of it is there"
+    return f"{name}: about {60 * hours:.0f} minutes with two processes, if nothing of it is there"
 
 
 def recorded_hours(name: str | None, runs: int) -> float:
