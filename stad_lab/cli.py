@@ -289,7 +289,7 @@ def replicate(
 ) -> None:
     """Run one experiment of the replication: V and M, CMA-ES and an evaluation for every seed.
 
-    It says first how long it will take. Stop it when you like; the same command continues.
+    It says first how long it took us. Stop it when you like; the same command continues.
 
     Args:
         experiment: Its name; `claims` lists them.
@@ -306,7 +306,7 @@ def replicate(
         print("\n".join(f"kept {name}" for name in kept) or "no seed is finished")
         return
     with cluster_of(scheduler) as executor:
-        print(run.describe_time(experiment, run.time_needed(experiment, seeds)), flush=True)
+        print(run.describe_time(experiment, seeds), flush=True)
         print(run.describe(experiment, run.replicate(experiment, folder, executor, seeds)))
 
 
@@ -347,7 +347,7 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
 def latents(
     out: str,
     preset: Literal["quick", "laptop", "paper"] = "laptop",
-    parts: tuple[Literal["probe", "bar", "vae", "mdn_rnn"], ...] = (),
+    parts: tuple[Literal["probe", "vae", "mdn_rnn"], ...] = (),
     dataset: Path | None = None,
 ) -> None:
     """Measure the shipped V and M, and what they are compared with, on unseen episodes.
