@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pandas
 
+from stad_lab.agent import PRETRAINED
 from stad_lab.config import VARIANTS
 from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
 from stad_lab.replication import measurements, tables
-from stad_lab.replication.experiments import BASELINE_DRIVERS, CHANGES, EXPERIMENTS, RECIPES
+from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS, RECIPES
 from stad_lab.training.pipeline import total_budget
 
 CLAIMS = tables.DATA / "claims.json"
-PRETRAINED = Path(__file__).parent.parent / "pretrained"
 PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # on CarRacing-v0
 PAPER_OTHERS = {  # the rest of the paper's table
     "Task-aware AE": 200.0, "DQN": 343.0, "DDPG": 100.0, "A3C, continuous": 591.0,
@@ -46,9 +46,6 @@ def compute_claims() -> dict[str, dict]:
         "agents": describe_agents(),
         "recipes": recipes,
         "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
-        "changes": compare_changes(returns),
-        "fine_tuning": {variant: compare_fine_tuning(returns, variant) for variant in VARIANTS},
-        "paper_runs": describe_paper_runs(returns, runs, generations),
         "final_sigma": final_sigma(generations),
         "fast_renderer": measurements.describe_fast(tables.read("fast_episodes")),
         "yaw_rate_of_z": yaw_rate,
@@ -122,7 +119,7 @@ def find_verdict(recipes: dict, best_episode: float, yaw_rate: dict) -> dict:
         found[name] = {
             **{"frame": frame, "paper_frame": PAPER["frame"], "baseline_passes": reached},
             **{"room": room, "has_room": room >= gain},
-            **{part: compared[part] for part in ("difference", "interval")},
+            **{"difference": compared["difference"], "interval": compared["interval"]},
             "outcome": outcome if reached and room >= gain else "cannot test",
         }
     outcomes = {recipe["outcome"] for recipe in found.values()} - {"cannot test"}
@@ -134,13 +131,11 @@ def find_verdict(recipes: dict, best_episode: float, yaw_rate: dict) -> dict:
     }
 
 
-def describe_agents(folder: Path = PRETRAINED) -> dict:
+def describe_agents() -> dict:
     """The shipped agents on the tracks 0 to 99, with Gymnasium's renderer."""
     found = {}
-    for path in sorted(folder.glob("*/evaluation.json")):
-        record, evaluation = (
-            load_json(path.with_name(name)) for name in ("record.json", path.name)
-        )
+    for path in sorted(PRETRAINED.glob("*/evaluation.json")):
+        record, evaluation = load_json(path.with_name("record.json")), load_json(path)
         returns = np.array([episode["return"] for episode in evaluation["episodes"]])
         found[path.parent.name] = {
             **statistics.summarise(returns),
@@ -149,49 +144,6 @@ def describe_agents(folder: Path = PRETRAINED) -> dict:
             "without_best_5": float(np.sort(returns)[:-5].mean()),
             "gymnasium": record["made_with"]["gymnasium"],
             **total_budget(record),
-        }
-    return found
-
-
-def compare_changes(returns: dict[str, np.ndarray]) -> dict:
-    """Single changes less what they change; the interval holds the variance of tracks alone."""
-    bases = {name: base or "one_iteration" for base, names in CHANGES.items() for name in names}
-    others = ("no_bar_input", "two_iterations_input", "no_replay")
-    found = {}
-    for name, base in (bases | dict.fromkeys(others, "one_iteration")).items():
-        before, after = returns[base], returns[name]
-        found[name] = {
-            **{"about": EXPERIMENTS[name].about, "base": base},
-            "difference": float(after.mean() - before.mean()),
-            "interval": statistics.bootstrap_difference(before, after),
-            "difference_of_medians": float(np.median(after) - np.median(before)),
-            "complete_laps": float((after >= statistics.SOLVED).mean()),
-        }
-    return found
-
-
-def compare_fine_tuning(returns: dict[str, np.ndarray], variant: str) -> dict:
-    """What fine-tuning gained, run by run on the same tracks."""
-    before, after = (returns[f"{recipe}_{variant}"] for recipe in ("two_iterations", "fine_tuned"))
-    failed = [(scores < statistics.FAILED).sum(axis=1).tolist() for scores in (before, after)]
-    interval = statistics.bootstrap(after - before)
-    found = {"gain": float((after - before).mean()), "interval": interval}
-    return found | dict(zip(("failed_before", "failed_after"), failed, strict=True))
-
-
-def describe_paper_runs(
-    returns: dict, runs: pandas.DataFrame, generations: pandas.DataFrame
-) -> dict:
-    """Each run of the paper's recipe; `vae` names the V that it had."""
-    found = {}
-    for run in runs[runs.experiment.str.startswith("paper_") & (runs.role == "run")].itertuples():
-        scores = returns[run.experiment][run.seed]
-        curve = learning_curve(runs, generations, run.experiment, run.seed)[1]
-        found[tables.key(run.experiment, run.seed)] = {
-            **{"vae": run.vae[:4], "mean": float(scores.mean())},
-            "complete_laps": int((scores >= statistics.SOLVED).sum()),
-            "failed": int((scores < statistics.FAILED).sum()),
-            "last_5_validations": float(curve[-5:].mean()),
         }
     return found
 
@@ -221,17 +173,6 @@ def final_sigma(generations: pandas.DataFrame) -> dict:
     last = paper.groupby(["experiment", "seed"])["sigma"].last()
     each = {tables.key(*run): float(sigma) for run, sigma in last.items()}
     return {"geometric_mean": float(np.exp(np.log(last).mean())), **each}
-
-
-def forest(claims: dict) -> list[dict]:
-    """Data of a forest plot: an entry for each recipe and variant but `frame`, with all runs."""
-    shown = ("runs", "difference", "interval", "welch_p")
-    return [
-        {"recipe": recipe, "variant": variant, "frame": found["frame"]["runs"]}
-        | {name: found[variant][name] for name in shown}
-        for recipe, found in claims["recipes"].items()
-        for variant in VARIANTS[1:]
-    ]
 
 
 def write_claims(path: Path = CLAIMS) -> Path:

@@ -92,26 +92,19 @@ def make_experiments() -> dict[str, Experiment]:
             "no_bar": {"config": no_bar, "seeds": (0, 1), "retrained": True},
         }.items():
             found[f"{recipe}_{name}"] = Experiment(RECIPES[recipe], **fields)
-    return found | make_changes(found["two_iterations_input"])
-
-
-def make_changes(base: Experiment) -> dict[str, Experiment]:
-    """The experiments that change parts of a recipe, all with the variant of `base`."""
-    two, first, shared = base.config, base.first, f"two_iterations_{base.config.variant}"
-    found = {
-        "one_iteration": Experiment("one iteration", first.replace(**evolution(generations=55)))
-    }
+    base = found["two_iterations_input"]
+    one_iteration = base.first.replace(**evolution(generations=55))
+    found["one_iteration"] = Experiment("one iteration", one_iteration)
     for world_model, changed in CHANGES.items():
         for name, (about, changes) in changed.items():
             config = found[world_model or "one_iteration"].config.replace(**changes)
             found[name] = Experiment(about, config, None, (0,), world_model)
-    long, new = evolution(generations=160, sigma_decay=0.99), evolution(replay_share=0.0)
-    early, about = [one.replace(**EARLY_RECIPE) for one in (two, first)], "two iterations, "
-    longer = Experiment(about + "four times as long", two.replace(**long), first, (0,), shared)
-    only_new = Experiment(about + "new tracks only", two.replace(**new), first, (0,))
-    before = Experiment(about + "before the recipe was improved", *early, (0,))
-    found |= {"long_two_iterations": longer, "no_replay": only_new, "early_recipe": before}
-    return found
+    only_new, about = base.config.replace(**evolution(replay_share=0.0)), "two iterations, "
+    early = [one.replace(**EARLY_RECIPE) for one in (base.config, base.first)]
+    return found | {
+        "no_replay": Experiment(about + "new tracks only", only_new, base.first, (0,)),
+        "early_recipe": Experiment(about + "before the recipe was improved", *early, (0,)),
+    }
 
 
 EXPERIMENTS = make_experiments()

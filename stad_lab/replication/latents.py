@@ -1,60 +1,35 @@
 """What the latents carry, and how good V and M are, on episodes that nothing was trained on::
 
     probe    a linear probe for six quantities of the car's true motion, from z and from z with h:
-             in every variant, in an untrained V, and for other strides
-    bar      the same for the shipped agents' V and M, which see the indicator bar
+             in every variant without and with the indicator bar, untrained, and for other strides
     vae      the errors of V in every variant, and rate against distortion over the KL weight
     mdn_rnn  the NLL of M beside simple predictions and reduced M, its calibration, and the error
              of its dreams
 
-The V and M trained without the bar (`cropped_...`) are measured. What they are compared with is
-trained in a working folder, on a dataset of the same configuration, and kept there.
+The shipped V and M are measured, those without the bar ("cropped_...") if not said otherwise. What
+they are compared with is trained in a working folder, on a dataset of its own, and kept there.
 """
 
 import dataclasses
-import functools
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from stad_lab.agent import PRETRAINED, encode_episode, load_agent, remember_episode, run_folder
-from stad_lab.config import VARIANTS, Config, random_stream, track_seeds
+from stad_lab.agent import PRETRAINED, load_agent, remember_episode, run_folder
+from stad_lab.config import VARIANTS, Config, check_same, random_stream, track_seeds
 from stad_lab.envs.frames import earlier_frames
-from stad_lab.evaluation.metrics import (
-    ACTIVE,
-    constant_prediction,
-    dream_open_loop,
-    horizon_errors,
-    linear_prediction,
-    mixture_nll,
-    pit,
-    predict,
-    repeat_prediction,
-    single_step_nll,
-    vae_metrics,
-)
+from stad_lab.evaluation import metrics, trajectories
+from stad_lab.evaluation.metrics import predict
 from stad_lab.evaluation.probe import probe
 from stad_lab.evaluation.statistics import bootstrap
-from stad_lab.evaluation.trajectories import (
-    MOTION,
-    Trajectory,
-    encode_trajectory,
-    record_random_trajectory,
-    record_trajectory,
-    road_in_sight,
-)
+from stad_lab.evaluation.trajectories import MOTION, Trajectory, encode_trajectory
+from stad_lab.io import weights
 from stad_lab.io.files import load_json, save_json
-from stad_lab.io.weights import (
-    MDN_RNN_FILE,
-    VAE_FILE,
-    WorldModel,
-    check_belongs,
-    load_mdn_rnn,
-    load_vae,
-    load_world_model,
-)
+from stad_lab.io.weights import WorldModel, load_world_model
 from stad_lab.io.workers import run_in_order, worker_threads
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE, kl_divergence
@@ -86,14 +61,29 @@ Drivers = dict[str, tuple[list[Trajectory], int]]
 """Driver -> its trajectories, and how many first frames of each are not probed."""
 
 
-def measure(config: Config, dataset_folder: Path, work: Path, parts: list[str]) -> dict:
-    """Measure some parts, and write each into `work/latents.json` as soon as it is measured.
+@dataclass(frozen=True)
+class Study:
+    """What every part of `measure` works with."""
 
-    Args:
-        config: of the dataset and of what is trained here.
-        dataset_folder: collected if it is not there.
-        work: folder for what is trained.
-        parts: some of PARTS.
+    config: Config  # of the dataset and of what is trained here
+    dataset: Path
+    work: Path  # folder for what is trained
+    trajectories: list[Trajectory]  # of the random driver
+
+
+class Encoder(NamedTuple):
+    """A V, how its pictures are made, and the M (by name) whose h is probed with its z."""
+
+    vae: VAE
+    stride: int
+    crop_bar: bool
+    memories: dict[str, MDNRNN]
+
+
+def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[str]) -> dict:
+    """Measure some of PARTS, and write each into `work/latents.json` as soon as it is measured.
+
+    The dataset is collected if it is not there.
 
     Returns:
         A dict for JSON: for each part what was found, its "config" and what it was "made_with".
@@ -102,13 +92,13 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: list[str]) 
         raise ValueError(f"unknown part {unknown[0]!r}: choose from {', '.join(PARTS)}")
     collect(config, dataset_folder)
     count = max(FEWEST, config.data.episodes // 5)
-    trajectories = random_trajectories(count, config.seed + 1, config.processes)
-    file, result = Path(work) / "latents.json", {}
+    driven = random_trajectories(count, config.seed + 1, config.processes)
+    study, file, result = Study(config, dataset_folder, work, driven), work / "latents.json", {}
     for name in parts:
-        found = PARTS[name](config, Path(dataset_folder), Path(work), trajectories)
+        found = PARTS[name](study)
         made_with = provenance(f"python -m stad_lab latents --parts {name} --out ...")
-        about = {"trajectories": len(trajectories), "config": config.as_dict()}
-        result[name] = {**found, **about, "made_with": made_with}
+        about = {"trajectories": len(driven), "config": config.as_dict(), "made_with": made_with}
+        result[name] = found | about
         save_json(file, (load_json(file) if file.exists() else {}) | result)
     return result
 
@@ -116,110 +106,74 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: list[str]) 
 def random_trajectories(count: int, seed: int, processes: int) -> list[Trajectory]:
     """Trajectories of the random driver, from random tiles of tracks kept for inspection."""
     data = {"episodes": count, "episode_frames": RANDOM_FRAMES, "random_starts": 1.0}
-    one = functools.partial(record_random_trajectory, Config(seed=seed).replace(data=data))
-    return record_all(one, list(range(count)), "random", processes)
-
-
-def agent_trajectories(count: int, processes: int) -> list[Trajectory]:
-    """The beginnings of episodes of AGENT: the road at speed, which no random driver sees."""
-    return record_all(begin_episode, track_seeds("inspect", count, 2), "agent", processes)
-
-
-def record_all(
-    record: Callable[[int], Trajectory], numbers: list[int], label: str, processes: int
-) -> list[Trajectory]:
-    """`record` of every number, in worker processes."""
+    tasks = [(Config(seed=seed).replace(data=data), index) for index in range(count)]
     with worker_threads(processes) as executor:
-        tasks = [(number,) for number in numbers]
-        return run_in_order(executor, record, tasks, f"{label} trajectories")
+        record = trajectories.record_random_trajectory
+        return run_in_order(executor, record, tasks, "random trajectories")
 
 
-def begin_episode(track: int) -> Trajectory:
-    """The first frames of an episode of AGENT. Runs in a worker."""
-    return record_trajectory(load_agent(AGENT), track, AGENT_FRAMES)
+def two_drivers(driven: list[Trajectory], processes: int) -> Drivers:
+    """The random driver's trajectories, and a third as many of AGENT: the road at speed."""
+    tracks = track_seeds("inspect", max(FEWEST, len(driven) // 3), 2)
+    tasks = [(load_agent(AGENT), track, AGENT_FRAMES) for track in tracks]
+    with worker_threads(processes) as executor:
+        record = trajectories.record_trajectory
+        by_agent = run_in_order(executor, record, tasks, "agent trajectories")
+    return {"random driver": (driven, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
 
 
-def two_drivers(trajectories: list[Trajectory], processes: int) -> Drivers:
-    """The random driver's trajectories, and a third as many of AGENT."""
-    by_agent = agent_trajectories(max(FEWEST, len(trajectories) // 3), processes)
-    return {"random driver": (trajectories, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
+def shipped(prefix: str = "cropped_") -> Iterator[tuple[str, WorldModel]]:
+    """The variants, and the shipped V and M of each; with the prefix "" those that see the bar."""
+    for variant in VARIANTS:
+        yield variant, load_world_model(PRETRAINED / f"{prefix}{variant}")
 
 
-def probe_part(
-    config: Config, dataset_folder: Path, work: Path, trajectories: list[Trajectory]
-) -> dict:
-    """Probe the latents of every variant, and of every stride, under two drivers."""
-    drivers = two_drivers(trajectories, config.processes)
-    result = {"variants": probe_variants(config, "cropped_", drivers), "strides": {}}
-    for driver, (driven, skip) in drivers.items():
-        found = result["strides"][driver] = {}
-        for stride in STRIDES:
-            vae = shorter_vae(config, dataset_folder, work, stride=stride)
-            found[str(stride)] = probe_trajectories(driven, skip, vae, {}, stride, True)
-    return result
-
-
-def bar_part(
-    config: Config, dataset_folder: Path, work: Path, trajectories: list[Trajectory]
-) -> dict:
-    """Probe the shipped agents' V and M: do their latents carry what the indicator bar shows?"""
-    drivers = two_drivers(trajectories, config.processes)
-    return {"variants": probe_variants(config.replace(data={"crop_bar": False}), "", drivers)}
-
-
-def probe_variants(config: Config, prefix: str, drivers: Drivers) -> dict:
-    """Probe the shipped V and M of every variant, and untrained ones.
-
-    Returns:
-        Driver -> source -> features -> what `probe_trajectories` finds.
-    """
-    sizes = config.vae.latent_size, config.vae.width
+def probe_part(study: Study) -> dict:
+    """Probe the latents of every variant, of untrained V, and of every stride: two drivers."""
+    config, (v, m) = study.config, (study.config.vae, study.config.mdn_rnn)
     with torch_settings(config.seed, 0):
-        untrained = {name: VAE(name, *sizes) for name in ("frame", "input_output")}
-        settings = config.mdn_rnn
-        untrained_mdn_rnn = MDNRNN(sizes[0], settings.hidden_size, settings.mixtures)
-    result = {}
-    for driver, (driven, skip) in drivers.items():
-        found = result[driver] = {}
-        for variant in VARIANTS:
-            world_model = load_world_model(PRETRAINED / f"{prefix}{variant}")
-            how = world_model.stride, world_model.crop_bar
-            memories = {"z, h": world_model.mdn_rnn, "z, h of an untrained M": untrained_mdn_rnn}
-            found[variant] = probe_trajectories(driven, skip, world_model.vae, memories, *how)
-        for name, vae in untrained.items():
-            how = config.vae.stride, config.data.crop_bar
-            found[f"{name}, untrained"] = probe_trajectories(driven, skip, vae, {}, *how)
-    return result
+        untrained = {name: VAE(name, v.latent_size, v.width) for name in ("frame", "input_output")}
+        mdn_rnn = MDNRNN(v.latent_size, m.hidden_size, m.mixtures)
+    encoders = {}
+    for prefix in ("cropped_", ""):
+        for variant, model in shipped(prefix):
+            memories = {"z, h": model.mdn_rnn, "z, h of an untrained M": mdn_rnn}
+            encoder = Encoder(model.vae, model.stride, model.crop_bar, memories)
+            encoders[f"{prefix}{variant}"] = encoder
+    for name, vae in untrained.items():
+        encoders[f"{name}, untrained"] = Encoder(vae, v.stride, config.data.crop_bar, {})
+    for stride in STRIDES:
+        encoders[f"stride {stride}"] = shorter_encoder(study, stride=stride)
+    return {"drivers": probe_all(two_drivers(study.trajectories, config.processes), encoders)}
 
 
-def probe_trajectories(
-    trajectories: list[Trajectory],
-    skip: int,
-    vae: VAE,
-    memories: dict[str, MDNRNN],
-    stride: int,
-    crop_bar: bool,
-) -> dict:
-    """Probe the mean of z, which C sees, and z with the memory of each M in `memories`.
+def probe_all(drivers: Drivers, encoders: dict[str, Encoder]) -> dict:
+    """Driver -> encoder -> what `probe_trajectories` finds."""
+    return {
+        driver: {name: probe_trajectories(*driven, one) for name, one in encoders.items()}
+        for driver, driven in drivers.items()
+    }
+
+
+def probe_trajectories(driven: list[Trajectory], skip: int, encoder: Encoder) -> dict:
+    """Probe the mean of z, which C sees, and z with the memory of each M.
 
     Only frames count in which the road is in sight, after the first `skip` of each trajectory.
 
     Returns:
         {"z": {quantity: {"r2": number, "interval": [low, high]}}}, and so for every M.
     """
-    latents = [encode_trajectory(vae, one, stride, crop_bar)[0] for one in trajectories]
+    vae, stride, crop_bar, memories = encoder
+    latents = [encode_trajectory(vae, one, stride, crop_bar)[0] for one in driven]
     features = {"z": np.concatenate(latents)}
     for name, mdn_rnn in memories.items():
-        hidden = [
-            remember_episode(mdn_rnn, z, one.actions)
-            for z, one in zip(latents, trajectories, strict=True)
-        ]
+        pairs = zip(latents, driven, strict=True)
+        hidden = [remember_episode(mdn_rnn, z, one.actions) for z, one in pairs]
         features[name] = np.concatenate([features["z"], np.concatenate(hidden)], axis=1)
-    lengths = [len(one) for one in trajectories]
-    motion = np.concatenate([one.motion for one in trajectories])
-    number = np.repeat(np.arange(len(trajectories)), lengths)
-    moment = np.concatenate([np.arange(length) for length in lengths])
-    kept = road_in_sight(motion) & (moment >= skip)
+    motion = np.concatenate([one.motion for one in driven])
+    number = np.repeat(np.arange(len(driven)), [len(one) for one in driven])
+    moment = np.concatenate([np.arange(len(one)) for one in driven])
+    kept = trajectories.road_in_sight(motion) & (moment >= skip)
     result = {}
     for name, seen in features.items():
         found = probe(seen[kept], motion[kept], number[kept])
@@ -236,7 +190,6 @@ def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> di
     Args:
         source: a shipped agent, or the folder of a run with V and M.
         count: trajectories of the random driver.
-        processes: that drive.
 
     Returns:
         A dict for JSON: "variant", checksums of "vae" and "mdn_rnn", "trajectories", "drivers"
@@ -250,16 +203,14 @@ def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> di
         raise ValueError(f"episodes={count}: expected at least {FEWEST}, to fit and measure on")
     model = load_world_model(run_folder(source))
     drivers = two_drivers(random_trajectories(count, PROBE_SEED, processes), processes)
-    memories, how = {"z, h": model.mdn_rnn}, (model.stride, model.crop_bar)
+    encoder = Encoder(model.vae, model.stride, model.crop_bar, {"z, h": model.mdn_rnn})
+    found = probe_all(drivers, {"run": encoder})
     return {
         "kind": "probe",
         "variant": model.vae.variant,
         **model.checksums,
         "trajectories": count,
-        "drivers": {
-            name: probe_trajectories(driven, skip, model.vae, memories, *how)
-            for name, (driven, skip) in drivers.items()
-        },
+        "drivers": {driver: by_encoder["run"] for driver, by_encoder in found.items()},
         "made_with": provenance("python -m stad_lab probe --run ..."),
     }
 
@@ -275,64 +226,60 @@ def describe_probe(found: dict) -> str:
     return "\n".join(lines)
 
 
-def shorter_vae(config: Config, dataset_folder: Path, work: Path, **change) -> VAE:
+def shorter_encoder(study: Study, **change) -> Encoder:
     """V of `input_output`, trained with one change for a share of the steps; kept in `work`."""
     ((name, value),) = change.items()
-    if value == getattr(config.vae, name):  # no change: one training serves all comparisons
-        name, value = "stride", config.vae.stride
-    settings = {"steps": round(SHORTER * config.vae.steps), **change}
-    folder = work / f"{name}_{value:g}"
-    changed = config.replace(variant="input_output", vae=settings)
-    train(changed, folder, dataset_folder, until="vae")
-    return load_vae(folder / VAE_FILE)[0]
+    usual = study.config.vae
+    if value == getattr(usual, name):  # no change: one training serves all comparisons
+        name, value = "stride", usual.stride
+    folder = study.work / f"{name}_{value:g}"
+    settings = {"steps": round(SHORTER * usual.steps), **change}
+    config = study.config.replace(variant="input_output", vae=settings)
+    train(config, folder, study.dataset, until="vae")
+    vae, _ = weights.load_vae(folder / weights.VAE_FILE)
+    return Encoder(vae, config.vae.stride, config.data.crop_bar, {})
 
 
-def vae_part(
-    config: Config, dataset_folder: Path, work: Path, trajectories: list[Trajectory]
-) -> dict:
+def vae_part(study: Study) -> dict:
     """Measure V of every variant, and rate against distortion."""
 
-    def metrics(vae: VAE, stride: int, crop_bar: bool) -> dict:
-        films = [one.frames(crop_bar) for one in trajectories]
-        pairs = [(film[stride::3], earlier_frames(film, stride)[stride::3]) for film in films]
-        return vae_metrics(vae, *(np.concatenate(part) for part in zip(*pairs, strict=True)))
+    def measured(vae: VAE, stride: int, crop_bar: bool) -> dict:
+        films = [one.frames(crop_bar) for one in study.trajectories]
+        frames = np.concatenate([film[stride::3] for film in films])
+        earlier = np.concatenate([earlier_frames(film, stride)[stride::3] for film in films])
+        return metrics.vae_metrics(vae, frames, earlier)
 
-    variants, rate_distortion = {}, {}
-    for variant in VARIANTS:
-        model = load_world_model(PRETRAINED / f"cropped_{variant}")
-        variants[variant] = metrics(model.vae, model.stride, model.crop_bar)
-    for weight in KL_WEIGHTS:
-        vae = shorter_vae(config, dataset_folder, work, kl_weight=weight)
-        rate_distortion[f"{weight:g}"] = metrics(vae, config.vae.stride, config.data.crop_bar)
-    return {"variants": variants, "rate_distortion": rate_distortion}
+    variants = {
+        variant: measured(model.vae, model.stride, model.crop_bar) for variant, model in shipped()
+    }
+    shorter = {f"{one:g}": shorter_encoder(study, kl_weight=one) for one in KL_WEIGHTS}
+    distortion = {weight: measured(*one[:3]) for weight, one in shorter.items()}
+    return {"variants": variants, "rate_distortion": distortion}
 
 
-def mdn_rnn_part(
-    config: Config, dataset_folder: Path, work: Path, trajectories: list[Trajectory]
-) -> dict:
+def mdn_rnn_part(study: Study) -> dict:
     """Measure M of every variant; for `input` also the reduced M."""
-    whole = [one for one in trajectories if len(one) == RANDOM_FRAMES]
+    whole = [one for one in study.trajectories if len(one) == RANDOM_FRAMES]
     actions = np.array([one.actions for one in whole])
     result = {"whole_trajectories": len(whole), "horizon_steps": HORIZON, "variants": {}}
-    for variant in VARIANTS:
-        model = load_world_model(PRETRAINED / f"cropped_{variant}")
-        encoded = [encode_episode(model.vae, one.frames(True), model.stride) for one in whole]
+    for variant, model in shipped():
+        how = model.stride, model.crop_bar
+        encoded = [encode_trajectory(model.vae, one, *how) for one in whole]
         mu, logvar = np.array(encoded).swapaxes(0, 1)
         z = sample_latents(mu, logvar, random_stream("heldout", 0))
         kl = kl_divergence(torch.from_numpy(mu), torch.from_numpy(logvar))
-        active = kl.mean(dim=(0, 1)).numpy() > ACTIVE
-        mixture = predict(model.mdn_rnn, z, actions)
-        counts, _ = np.histogram(pit(mixture, z)[..., active], bins=20, range=(0, 1))
-        dreamed = dream_open_loop(model.mdn_rnn, mu[:DREAMERS], actions[:DREAMERS], AWAKE)
-        nll = {"M": mixture_nll(mixture, z), **simple_predictions(z, actions)}
+        active = kl.mean(dim=(0, 1)).numpy() > metrics.ACTIVE
+        mixture, some = predict(model.mdn_rnn, z, actions), mu[:DREAMERS]
+        counts, _ = np.histogram(metrics.pit(mixture, z)[..., active], bins=20, range=(0, 1))
+        dreamed = metrics.dream_open_loop(model.mdn_rnn, some, actions[:DREAMERS], AWAKE)
+        nll = {"M": metrics.mixture_nll(mixture, z), **simple_predictions(z, actions)}
         if variant == "input":
-            one = config.replace(variant=variant)
-            nll |= reduced_predictions(one, dataset_folder, work, model, z, actions)
+            nll |= reduced_predictions(study, model, z, actions)
         result["variants"][variant] = {
             "active": int(active.sum()),
             "nll": compare(nll, active),
             "pit": (counts / counts.sum()).tolist(),
-            "horizon": horizon_errors(model.vae, dreamed, mu[:DREAMERS], AWAKE, HORIZON),
+            "horizon": metrics.horizon_errors(model.vae, dreamed, some, AWAKE, HORIZON),
         }
     return result
 
@@ -370,44 +317,48 @@ def simple_predictions(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarr
     half = len(z) // 2
     fitted = z[:half], actions[:half]
     return {
-        "always the same": constant_prediction(z[:half], z),
-        "repeat the last z": repeat_prediction(z[:half], z),
-        "linear, last z": linear_prediction(*fitted, z, actions, order=1),
-        "linear, last 4 z": linear_prediction(*fitted, z, actions, order=4),
+        "always the same": metrics.constant_prediction(z[:half], z),
+        "repeat the last z": metrics.repeat_prediction(z[:half], z),
+        "linear, last z": metrics.linear_prediction(*fitted, z, actions, order=1),
+        "linear, last 4 z": metrics.linear_prediction(*fitted, z, actions, order=4),
     }
 
 
 def reduced_predictions(
-    config: Config,
-    dataset_folder: Path,
-    work: Path,
-    model: WorldModel,
-    z: np.ndarray,
-    actions: np.ndarray,
+    study: Study, model: WorldModel, z: np.ndarray, actions: np.ndarray
 ) -> dict[str, np.ndarray]:
     """NLL of M that lack something, trained like the whole one."""
-    result, weights = {}, model.checksums["vae"]
+    result, usual = {}, study.config.mdn_rnn
     for name, (changes, sees_actions) in REDUCED.items():
-        path = work / name.replace(" ", "_") / MDN_RNN_FILE
-        reduced = config.replace(mdn_rnn=changes)
-        frames = config.mdn_rnn.batch * config.mdn_rnn.sequence
-        reduced = reduced.replace(mdn_rnn={"batch": frames // reduced.mdn_rnn.sequence})
-        if not path.exists():
-            dataset = Dataset(dataset_folder)
-            shown = [action * sees_actions for action in dataset.actions]
-            encoded = encode_dataset(model.vae, dataset, model.stride)
-            latents = Latents(encoded, shown, dataset.first_heldout, weights)
-            with torch_settings(config.seed, 1) as device:
-                fit_mdn_rnn(reduced, latents, path, device)
-        mdn_rnn, metadata = load_mdn_rnn(path)
-        check_belongs(path, metadata, vae=weights)
-        if metadata["mdn_rnn"] != dataclasses.asdict(reduced.mdn_rnn):
-            raise ValueError(f"{path} was trained with other settings: choose another folder")
+        reduced = study.config.replace(variant=model.vae.variant, mdn_rnn=changes)
+        batch = usual.batch * usual.sequence // reduced.mdn_rnn.sequence
+        reduced = reduced.replace(mdn_rnn={"batch": batch})
+        path = study.work / name.replace(" ", "_") / weights.MDN_RNN_FILE
+        mdn_rnn = reduced_mdn_rnn(reduced, study.dataset, path, model, sees_actions)
         if reduced.mdn_rnn.sequence > 1:
-            result[name] = mixture_nll(predict(mdn_rnn, z, actions * sees_actions), z)
+            mixture = predict(mdn_rnn, z, actions * sees_actions)
+            result[name] = metrics.mixture_nll(mixture, z)
         else:
-            result[name] = single_step_nll(mdn_rnn, z, actions)
+            result[name] = metrics.single_step_nll(mdn_rnn, z, actions)
     return result
 
 
-PARTS = {"probe": probe_part, "bar": bar_part, "vae": vae_part, "mdn_rnn": mdn_rnn_part}
+def reduced_mdn_rnn(
+    config: Config, dataset_folder: Path, path: Path, model: WorldModel, sees_actions: bool
+) -> MDNRNN:
+    """An M for V of `model`, trained with actions or without; that in `path`, if it is there."""
+    vae = model.checksums["vae"]
+    if not path.exists():
+        dataset = Dataset(dataset_folder)
+        shown = [action * sees_actions for action in dataset.actions]
+        encoded = encode_dataset(model.vae, dataset, model.stride)
+        with torch_settings(config.seed, 1) as device:
+            latents = Latents(encoded, shown, dataset.first_heldout, vae)
+            fit_mdn_rnn(config, latents, path, device)
+    mdn_rnn, metadata = weights.load_mdn_rnn(path)
+    weights.check_belongs(path, metadata, vae=vae)
+    check_same(path, metadata["mdn_rnn"], dataclasses.asdict(config.mdn_rnn))
+    return mdn_rnn
+
+
+PARTS = {"probe": probe_part, "vae": vae_part, "mdn_rnn": mdn_rnn_part}

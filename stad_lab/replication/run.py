@@ -13,7 +13,6 @@ there is not done again.
 """
 
 import filecmp
-import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -23,17 +22,11 @@ import numpy as np
 
 from stad_lab.agent import rollout
 from stad_lab.config import Config, random_stream
-from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.evaluation.evaluate import KIND, evaluate, load_evaluation, report
 from stad_lab.evaluation.statistics import summarise
 from stad_lab.io.files import checksum_of_arrays, copy_file, save_json
-from stad_lab.io.weights import (
-    CONTROLLER_FILE,
-    MDN_RNN_FILE,
-    VAE_FILE,
-    load_controller,
-)
+from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_controller
 from stad_lab.io.workers import run_in_order, worker_threads
 from stad_lab.models.controller import squash
 from stad_lab.replication import tables
@@ -50,13 +43,15 @@ from stad_lab.training.pipeline import RECORD, provenance, train
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE
 
 EVALUATION = "evaluation.json"
+Seeds = Sequence[int] | None
+"""Some seeds of an experiment; None for all."""
 
 
 def replicate(
     name: str,
     folder: str | Path,
     executor: Executor | None = None,
-    seeds: Sequence[int] | None = None,
+    seeds: Seeds = None,
 ) -> dict:
     """Run an experiment, or what is missing of it; call it again to continue.
 
@@ -71,7 +66,6 @@ def replicate(
 
     Raises:
         ValueError: an unknown experiment or seed, or a folder with something else in it.
-        OSError, TaskError, FloatingPointError: as `train` and `evaluate`.
     """
     own = Path(folder) / name
     if is_baseline(name, seeds):
@@ -105,15 +99,15 @@ def summary(folders: list[Path]) -> dict:
     return {"seeds": len(folders), **summarise(np.array(returns))}
 
 
-def is_baseline(name: str, seeds: Sequence[int] | None = None) -> bool:
-    """Whether an experiment is a driver that does not look; ValueError if it is given seeds."""
+def is_baseline(name: str, seeds: Seeds = None) -> bool:
+    """Whether an experiment is a baseline driver; ValueError if that is given seeds."""
     if name in BASELINE_DRIVERS and seeds:
         raise ValueError(f"{name!r} is no training and has no seeds: leave them out")
     return name in BASELINE_DRIVERS
 
 
 def drive_baseline(name: str, folder: Path, executor: Executor | None) -> None:
-    """Drive the tracks of the evaluation without looking; writes the evaluation and a record."""
+    """Drive the tracks of the evaluation blindly; writes the evaluation and a record."""
     if (folder / EVALUATION).exists():
         return
     begin, tracks = time.perf_counter(), list(range(TRACKS))
@@ -128,19 +122,12 @@ def drive_baseline(name: str, folder: Path, executor: Executor | None) -> None:
     save_json(folder / EVALUATION, found | {"seconds": time.perf_counter() - begin})
 
 
-class ConstantDriver:
+class ConstantDriver(RandomDriver):
     """Drives straight on with the gas of the first controller of CMA-ES."""
 
-    def reset(self) -> None:
-        """Begin an episode."""
-
-    def act_batch(self, seen: np.ndarray) -> np.ndarray:
-        """The action of every car, float32 (cars, 3)."""
-        action = squash(np.array([0.0, Config().evolution.initial_gas, 0.0]))
-        return np.tile(action.astype(np.float32), (len(seen), 1))
-
-    def keep(self, cars: np.ndarray) -> None:
-        """All cars are alike."""
+    def act(self) -> np.ndarray:
+        """The next action, float32 (3,)."""
+        return squash(np.array([0.0, Config().evolution.initial_gas, 0.0])).astype(np.float32)
 
 
 def drive_blindly(name: str, track: int) -> tuple[float, int]:
@@ -148,10 +135,8 @@ def drive_blindly(name: str, track: int) -> tuple[float, int]:
 
     Rewards do not depend on the renderer, so the fast one serves.
     """
-    driver = ConstantDriver()
-    if name == "random_driver":
-        driver = RandomDriver(random_stream("random driver", 0, track))
-    cars = Cars(1, "frame")
+    kind = RandomDriver if name == "random_driver" else ConstantDriver
+    driver, cars = kind(random_stream("random driver", 0, track)), Cars(1, "frame")
     cars.reset([track])
     episodes = rollout(driver, cars)
     return float(episodes.returns[0]), int(episodes.lengths[0])
@@ -171,23 +156,15 @@ def train_world_model(
 def share_world_model(config: Config, run: Path, world: Path) -> None:
     """Copy V and M into a run, and the components and first C that another seed has computed.
 
-    Those depend on V and M alone.
+    Those depend on V and M alone, so they are taken from seeds that have these V and M.
     """
     run.mkdir(parents=True, exist_ok=True)
-    names = (VAE_FILE, MDN_RNN_FILE) if config.mdn_rnn.steps else (VAE_FILE,)
-    sources = [world / name for name in names]
-    for other in sorted(run.parent.glob("seed*")):
-        if all(same_file(other / source.name, source) for source in sources[: len(names)]):
-            computed = (other / name for name in (COMPONENTS_FILE, START_FILE))
-            sources += [file for file in computed if file.exists()]
-    for source in sources:
-        if not (run / source.name).exists():
-            copy_file(source, run)
-
-
-def same_file(one: Path, other: Path) -> bool:
-    """Whether both files exist and hold the same bytes."""
-    return one.exists() and other.exists() and filecmp.cmp(one, other, shallow=False)
+    trained = (VAE_FILE, MDN_RNN_FILE) if config.mdn_rnn.steps else (VAE_FILE,)
+    for other in [world, *run.parent.glob("seed*")]:
+        if filecmp.cmpfiles(other, world, trained, shallow=False)[0] == list(trained):
+            for name in (*trained, COMPONENTS_FILE, START_FILE):
+                if (other / name).exists() and not (run / name).exists():
+                    copy_file(other / name, run)
 
 
 def evaluate_run(folder: Path, executor: Executor | None) -> None:
@@ -204,7 +181,7 @@ def evaluate_run(folder: Path, executor: Executor | None) -> None:
 def keep(
     name: str,
     folder: str | Path,
-    seeds: Sequence[int] | None = None,
+    seeds: Seeds = None,
     to: Path = tables.DATA,
 ) -> list[str]:
     """Add the finished seeds of an experiment to the tables; returns their names.
@@ -223,90 +200,24 @@ def keep(
     return kept
 
 
-def time_needed(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
-    """How long an experiment takes on this machine at most, in seconds: stage -> time.
-
-    It makes a short run with the sizes of the experiment, for about half a minute.
-    """
+def describe_time(name: str, seeds: Seeds = None) -> str:
+    """One line on how long an experiment took us, with everything that it builds on."""
     if is_baseline(name, seeds):
-        begin = time.perf_counter()
-        _, frames = drive_blindly(name, 0)
-        frame = (time.perf_counter() - begin) / frames / Config().processes
-        return {"evaluations": TRACKS * MAX_FRAMES * frame}
-    experiment = find_experiment(name, seeds)
-    if experiment.base:
-        times = time_needed(experiment.base, experiment.seeds)
-        longer = most_frames(experiment.config) / most_frames(EXPERIMENTS[experiment.base].config)
-        evaluations = 2 * times["evaluations"]
-        return times | {"fine-tuning": times["CMA-ES"] * longer, "evaluations": evaluations}
-    with tempfile.TemporaryDirectory() as folder:
-        cost = costs(experiment.config, Path(folder))
-    made, runs = experiment, len(experiment.seeds)
-    if experiment.world_model:
-        made = EXPERIMENTS[experiment.world_model]
-    iterations = [made.first, made.config] if made.first else [made.config]
-    iterations *= runs if experiment.retrained else 1
-    first = most_frames(made.first) if made.first else 0
-    return {
-        "dataset": cost["frame"] * sum(map(dataset_frames, iterations)),
-        "V": cost["vae"] * sum(one.vae.steps for one in iterations),
-        "M": cost["mdn_rnn"] * sum(one.mdn_rnn.steps for one in iterations),
-        "CMA-ES": cost["frame"] * (first + runs * most_frames(experiment.config)),
-        "evaluations": cost["official frame"] * runs * TRACKS * MAX_FRAMES,
-    }
+        hours = recorded_hours(name, 1)
+    else:
+        experiment = find_experiment(name, seeds)
+        hours = recorded_hours(name, len(experiment.seeds))
+        hours += recorded_hours(experiment.base, len(experiment.seeds))
+        hours += recorded_hours(experiment.world_model, 0)
+    return f"{name}: about {60 * hours:.0f} minutes with two processes, if nothing of it is there"
 
 
-def dataset_frames(config: Config) -> int:
-    """How many frames a dataset has at most."""
-    data = config.data
-    return data.episodes * data.episode_frames + data.agent_episodes * data.agent_frames
-
-
-def most_frames(config: Config) -> int:
-    """How many frames CMA-ES drives at most, with its validations."""
-    one = config.evolution
-    validations = one.generations // one.validate_every * one.validation_tracks
-    return (one.generations * one.population * one.tracks + validations) * one.max_frames
-
-
-def costs(config: Config, folder: Path) -> dict[str, float]:
-    """Seconds of a step of V and of M, and of a frame with the fast and with Gymnasium's renderer.
-
-    They are those of a short run of the same sizes, which it makes.
-    """
-    seconds = {}
-    brief = config.replace(
-        data={"episodes": 20, "agent_episodes": 0},
-        vae={"steps": 6},
-        mdn_rnn={"steps": min(4, config.mdn_rnn.steps)},
-        evolution={"generations": 2, "validate_every": 2, "validation_tracks": 1, "components": 0},
-    ).replace(evolution={"max_frames": 60})
-    for stage in ("dataset", "vae", "mdn_rnn", "controller"):
-        begin = time.perf_counter()
-        train(brief, folder, until=stage)
-        seconds[stage] = time.perf_counter() - begin
-    env = make_env(fast=False)
-    env.reset(seed=0)
-    begin = time.perf_counter()
-    for _ in range(60):
-        env.step(np.array([0.0, 0.1, 0.0], np.float32))
-    official = (time.perf_counter() - begin) / 60 / config.processes
-    env.close()
-    return {
-        "vae": seconds["vae"] / brief.vae.steps,
-        "mdn_rnn": seconds["mdn_rnn"] / max(1, brief.mdn_rnn.steps),
-        "frame": seconds["controller"] / most_frames(brief),
-        "official frame": official,
-    }
-
-
-def describe_time(name: str, times: dict[str, float]) -> str:
-    """One line that says how long an experiment takes."""
-    parts = ", ".join(
-        f"{part} {seconds / 60:.0f} min" for part, seconds in times.items() if seconds
-    )
-    hours = sum(times.values()) / 3600
-    return f"{name}: at most {hours:.1f} hours on this machine, if nothing of it is there ({parts})"
+def recorded_hours(name: str | None, runs: int) -> float:
+    """How long so many runs of an experiment took us, with the training of a shared V and M."""
+    table = tables.read("runs").query("experiment == @name")
+    seconds = table.filter(like="seconds.").sum(axis=1)
+    own = table["role"] == "run"
+    return (seconds[~own].sum() + runs * seconds[own].mean()) / 3600 if own.any() else 0.0
 
 
 def describe(name: str, found: dict) -> str:

@@ -138,9 +138,6 @@ def describe_record(record: dict) -> dict:
     line |= {"variant": record["variant"], "config.variant": None}
     line["continued_with"] = " ".join(one["commit"] for one in record.get("continued_with", []))
     line |= flatten({name: record.get(name, {}) for name in ("seconds", "budget")})
-    for stage, starts in record.get("peak_memory", {}).items():
-        for process in starts[0]:
-            line[f"megabytes.{stage}.{process}"] = max(start[process] for start in starts)
     line |= flatten(total_budget(record), "total.")
     return {name: value for name, value in line.items() if value is not None}
 
