@@ -83,7 +83,7 @@ HALVES = np.uint64(0x7FFF7FFF7FFF)  # the lanes of 256 times a colour that has b
 ROUND = np.uint64(0x008000800080)  # rounds 256 times a colour to the nearest level
 FRACTION = 16  # positions on the texture are fixed-point numbers with so many binary digits
 ONE = 1 << FRACTION
-BLOCK = 16  # pixels that are searched for flags at a time
+BLOCK = 8  # pixels that are searched for flags at a time
 
 # The car. The hull's origin lies at a corner between four pixels of the observation.
 HULL_ROW, HULL_COLUMN = 72, 48
@@ -131,6 +131,7 @@ class Ground(NamedTuple):
         texels: uint8 (cars, SIZE, SIZE), kinds, shades and flags.
         quarter, eighth, sixteenth: uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours
             (red in the lowest byte).
+        colors: uint8 (cars, 8, 3), in the order of TEXELS.
         palette: uint64 (cars, 256), the colour of each texel in 16-bit lanes.
         cells: uint8 (cars, CELLS, CELLS), HAS_ROAD where a road polygon may have painted.
         pattern: uint8 (PERIOD, PERIOD), texels of background and grass without a road.
@@ -140,6 +141,7 @@ class Ground(NamedTuple):
     quarter: np.ndarray
     eighth: np.ndarray
     sixteenth: np.ndarray
+    colors: np.ndarray
     palette: np.ndarray
     cells: np.ndarray
     pattern: np.ndarray
@@ -154,6 +156,7 @@ def make_ground(cars: int) -> Ground:
         quarter=np.zeros((cars, SIZE // 4, SIZE // 4), np.uint32),
         eighth=np.zeros((cars, SIZE // 8, SIZE // 8), np.uint32),
         sixteenth=np.zeros((cars, SIZE // 16, SIZE // 16), np.uint32),
+        colors=np.zeros((cars, len(TEXELS), 3), np.uint8),
         palette=np.zeros((cars, 256), np.uint64),
         cells=np.zeros((cars, CELLS, CELLS), np.uint8),
         pattern=field[first : first + PERIOD, first : first + PERIOD].copy(),
@@ -202,7 +205,7 @@ def paint(ground, car, road, kinds, colors):
         fill_polygon(texels, corners, kinds[number])
         mark_cells(cells, corners)
     mark_edges(texels, cells)
-    new_colors = set_palette(ground.palette[car], colors)
+    new_colors = set_palette(ground.palette[car], ground.colors[car], colors)
     shrink(ground, car, new_colors)
 
 
@@ -353,14 +356,16 @@ def mark_near_row(below, line, above, around):
 
 
 @compiled
-def set_palette(palette, colors):
-    """Spread the colours, uint8 (8, 3), to a palette, uint64 (256,); are there new ones?"""
+def set_palette(palette, own, colors):
+    """Store the colours, uint8 (8, 3), also in a palette, uint64 (256,); returns if they are new."""
     new = False
-    for flags in range(0, 256, 32):
-        for i in range(len(TEXELS)):
-            value = np.uint64(colors[i, 0]) | np.uint64(colors[i, 1]) << np.uint64(16)
-            value |= np.uint64(colors[i, 2]) << np.uint64(32)
-            new |= palette[flags + TEXELS[i]] != value
+    for i in range(len(TEXELS)):
+        value = np.uint64(0)
+        for channel in range(3):
+            new |= own[i, channel] != colors[i, channel]
+            own[i, channel] = colors[i, channel]
+            value |= np.uint64(colors[i, channel]) << np.uint64(16 * channel)
+        for flags in range(0, 256, 32):
             palette[flags + TEXELS[i]] = value
     return new
 
@@ -513,13 +518,13 @@ def warp_texels(out, ground, car, start, across, down, fine):
     rows, columns = out.shape[0], out.shape[1]
     pixels, texels = out.reshape(-1), ground.texels[car].reshape(-1)
     palette = ground.palette[car]
-    nearest = np.empty(rows * columns, np.uint8)  # the texel of each pixel
+    nearest = np.zeros(rows * columns + BLOCK, np.uint8)  # the texel of each pixel
     for row in range(rows):
         x, y = start[0] + row * down[0], start[1] + row * down[1]
         first, end = columns_on_texture(x, y, across, columns, ground.texels.shape[1])
         line = nearest[row * columns : (row + 1) * columns]
         read_texels(line, texels, x, y, across, first, end)
-    write_colors(pixels, nearest, palette)
+    write_colors(pixels, nearest, ground.colors[car])
     smooth_edges(pixels, nearest, texels, palette, columns, start, across, down, fine)
 
 
@@ -545,16 +550,15 @@ def read_texels(line, texels, x, y, across, first, end):
 
 
 @compiled
-def write_colors(pixels, nearest, palette):
-    """Turn texels, uint8 (n,), into colours, uint8 (3 n,): red, green, blue, red, ...
+def write_colors(pixels, nearest, colors):
+    """Turn the texels of pixels into colours, uint8 (3 n,): red, green, blue, red, ...
 
     Selections instead of a table: so the loop compiles to vector instructions, 64 pixels at once.
     """
-    background, grass = channels(palette[BACKGROUND]), channels(palette[GRASS])
-    road_0, road_1 = channels(palette[ROAD]), channels(palette[ROAD + 1])
-    road_2, outside = channels(palette[ROAD + 2]), channels(palette[OUTSIDE])
-    white, red = channels(palette[WHITE]), channels(palette[RED])
-    for i in range(len(nearest)):
+    background, grass, road_0 = row_of(colors, 0), row_of(colors, 1), row_of(colors, 2)
+    road_1, road_2, white = row_of(colors, 3), row_of(colors, 4), row_of(colors, 5)
+    red, outside = row_of(colors, 6), row_of(colors, 7)
+    for i in range(len(pixels) // 3):
         texel = np.uint8(nearest[i] & KIND_AND_SHADE)
         color = background
         color = grass if texel == GRASS else color
@@ -568,6 +572,12 @@ def write_colors(pixels, nearest, palette):
         pixels[place] = color[0]
         pixels[place + np.uint64(1)] = color[1]
         pixels[place + np.uint64(2)] = color[2]
+
+
+@merged
+def row_of(colors, i):
+    """Red, green and blue of colour i, as a tuple."""
+    return colors[i, 0], colors[i, 1], colors[i, 2]
 
 
 @compiled
@@ -585,18 +595,17 @@ def find_flagged(found, nearest, flag):
     processor may predict wrongly.
 
     Args:
-        found: uint16 (n + BLOCK,), to write.
-        nearest: uint8 (n,), the texels.
+        found: uint16 (n,), to write.
+        nearest: uint8 (n,), the texels and, at the end, BLOCK zeros.
         flag: uint8.
     """
     count = np.uint64(0)
-    for first in range(0, len(nearest), BLOCK):
+    for first in range(0, len(nearest) - BLOCK, BLOCK):
         flags = np.uint8(0)
-        end = min(first + BLOCK, len(nearest))
-        for i in range(first, end):
-            flags |= nearest[np.uint64(i)]
+        for i in range(BLOCK):
+            flags = np.uint8(flags | nearest[np.uint64(first + i)])
         if flags & flag:
-            for i in range(first, end):
+            for i in range(first, first + BLOCK):
                 found[count] = i
                 count += np.uint64((nearest[np.uint64(i)] & flag) != 0)
     return count
@@ -608,12 +617,12 @@ def smooth_edges(pixels, nearest, texels, palette, columns, start, across, down,
 
     Args:
         pixels: uint8 (3 n,), to write.
-        nearest: uint8 (n,), the texel of each pixel.
+        nearest: uint8 (n + BLOCK,), the texel of each pixel, and zeros.
         texels: uint8 (SIZE * SIZE,); `palette`: uint64 (256,).
         columns: of the picture.
         start, across, down, fine: as in `warp_texels`.
     """
-    found = np.empty(len(nearest) + BLOCK, np.uint16)
+    found = np.empty(len(nearest), np.uint16)
     for i in range(find_flagged(found, nearest, np.uint8(EDGE if fine else NEAR))):
         pixel = np.uint32(found[i])
         row = np.int64(np.uint32(pixel // np.uint32(columns)))
