@@ -1,4 +1,4 @@
-"""Pictures of CarRacing: a texture of the track, one affine warp, the car and the indicator bar on top.
+"""Pictures of CarRacing: a texture of the track, one affine warp, then the car and the bar.
 
 Gymnasium draws some 800 polygons on 1000 x 800 window pixels for every observation and shrinks the
 result to 96 x 96. But the ground hardly changes within an episode, and the camera is fixed to the
@@ -20,8 +20,8 @@ tells whether interpolation is needed. In the opening zoom a pixel covers many t
 them all would be slow, so there are copies of the texture at 1/4, 1/8 and 1/16 of its size, in
 colour (*mip levels*), and a picture uses the copy with about two texels per pixel.
 
-`draw_picture` makes the full observation, uint8 (96, 96, 3), or the agent's frame, uint8 (64, 64, 3),
-the latter straight from the texture. Everything is compiled by Numba and releases the GIL; nothing
+`draw_picture` makes the full observation, uint8 (96, 96, 3), or the agent's frame, uint8
+(64, 64, 3), straight from the texture. Everything is compiled by Numba and releases the GIL; nothing
 here knows Box2D. Images are indexed [row, column]; the texture's rows follow the world's y axis
 upward, its columns the x axis.
 
@@ -57,11 +57,11 @@ ZOOM = reference.ZOOM * reference.SCALE  # window pixels per world unit, after t
 DARKENING = 2  # pygame's smoothscale loses two levels of every channel to its fixed-point sums
 
 # The texture.
-FIELD = 1920  # texels, width and height of the field
+FIELD = 1920  # texels, width and height of the field: 1.9 to a pixel of the observation
 CELL = 16  # texels: the texture is restored and shrunk in cells of this size
 RIM = CELL  # texels of black around the field
 SIZE = FIELD + 2 * RIM  # texels, width and height of the texture
-SCALE = FIELD / (2 * reference.PLAYFIELD)  # texels per world unit: 1.9 to a pixel of the observation
+SCALE = FIELD / (2 * reference.PLAYFIELD)  # texels per world unit
 ORIGIN = SIZE / 2  # x and y of the world's origin, texels
 PERIOD = FIELD // 20  # texels from one grass square to the next
 CELLS = SIZE // CELL
@@ -88,22 +88,22 @@ BLOCK = 8  # pixels that are searched for flags at a time
 # The car. The hull's origin lies at a corner between four pixels of the observation.
 HULL_ROW, HULL_COLUMN = 72, 48
 QUARTER_ROWS, QUARTER_COLUMNS = 6, 4  # pixels, size of a quarter of the car
-CANVAS_ROWS = math.ceil(QUARTER_ROWS * PIXEL_H)  # a quarter is drawn in window pixels, then averaged
+CANVAS_ROWS = math.ceil(QUARTER_ROWS * PIXEL_H)  # of the window, in which a quarter is drawn
 CANVAS_COLUMNS = math.ceil(QUARTER_COLUMNS * PIXEL_W)
 TURN_STEPS, MAX_TURN = 24, 12  # a wheel's angle to the hull: steps of 1/24 rad, at most 12 of them
+LARGEST_TURN = MAX_TURN / TURN_STEPS  # radians
 PHASE_STEPS = 32  # a wheel's rotation: steps of 2 pi / 32
 CORNERS = 8  # of a polygon of the car; those with fewer corners repeat the last
-HULL_POLYGONS = np.array(  # world units
-    [
-        polygon + polygon[-1:] * (CORNERS - len(polygon))
-        for polygon in (
-            car_dynamics.HULL_POLY1,
-            car_dynamics.HULL_POLY2,
-            car_dynamics.HULL_POLY3,
-            car_dynamics.HULL_POLY4,
-        )
-    ]
-) * float(car_dynamics.SIZE)
+HULL_POLYGONS = [
+    polygon + polygon[-1:] * (CORNERS - len(polygon))
+    for polygon in (
+        car_dynamics.HULL_POLY1,
+        car_dynamics.HULL_POLY2,
+        car_dynamics.HULL_POLY3,
+        car_dynamics.HULL_POLY4,
+    )
+]
+HULL_POLYGONS = np.array(HULL_POLYGONS) * car_dynamics.SIZE  # (4, CORNERS, 2), world units
 WHEEL_PLACES = np.array(car_dynamics.WHEELPOS) * car_dynamics.SIZE  # world units
 WHEEL_HALF_WIDTH = car_dynamics.WHEEL_W * car_dynamics.SIZE
 WHEEL_RADIUS = car_dynamics.WHEEL_R * car_dynamics.SIZE
@@ -293,7 +293,7 @@ def visit(ground, car, tile):
 
 @compiled
 def mark_cells(cells, corners):
-    """Mark the cells around a polygon, corners in texels; 3 more texels hold all flags it causes."""
+    """Mark the cells around a polygon, corners in texels, with room for the flags it causes."""
     left, right, low, high = bounds(corners)
     for i in range(max(0, int(low - 3) // CELL), min(CELLS, int(high + 3) // CELL + 1)):
         for j in range(max(0, int(left - 3) // CELL), min(CELLS, int(right + 3) // CELL + 1)):
@@ -357,7 +357,12 @@ def mark_near_row(below, line, above, around):
 
 @compiled
 def set_palette(palette, own, colors):
-    """Store the colours, uint8 (8, 3), also in a palette, uint64 (256,); returns if they are new."""
+    """Store the colours, uint8 (8, 3), and make the palette; returns whether they are new.
+
+    Args:
+        palette: uint64 (256,), to write; `own`: uint8 (8, 3), to write.
+        colors: uint8 (8, 3).
+    """
     new = False
     for i in range(len(TEXELS)):
         value = np.uint64(0)
@@ -440,8 +445,8 @@ def look(out, ground, car, pose, zoom, pixel, corner):
 
     Args:
         out: uint8 (rows, columns, 3), the picture or a part of it.
-        pose: x, y and angle of the hull, which stands in the middle of the window, three quarters of
-            its height below the upper edge; the camera turns with it.
+        pose: x, y and angle of the hull, which stands in the middle of the window, three quarters
+            of its height below the upper edge; the camera turns with it.
         zoom: window pixels per world unit.
         pixel: width and height of a pixel of the picture, in window pixels.
         corner: row and column of the picture where `out` begins, floats.
@@ -471,7 +476,7 @@ def look(out, ground, car, pose, zoom, pixel, corner):
 @compiled
 def to_fixed(position):
     """A position or step in texels as a fixed-point number, int64."""
-    return int(math.floor(min(max(position, -1e9), 1e9) * ONE))
+    return math.floor(min(max(position, -1e9), 1e9) * ONE)
 
 
 @compiled
@@ -502,7 +507,7 @@ def columns_on_texture(x, y, across, columns, size):
     low, inner = margin * ONE, size - 1 - 2 * margin
     first_x, end_x = columns_inside(x - low, across[0], columns, inner)
     first_y, end_y = columns_inside(y - low, across[1], columns, inner)
-    first = max(first_x, first_y)
+    first = min(max(first_x, first_y), columns)
     return first, max(first, min(end_x, end_y))
 
 
@@ -633,9 +638,9 @@ def smooth_edges(pixels, nearest, texels, palette, columns, start, across, down,
             color = interpolate(texels, palette, x, y)
         else:  # the mean of two, a quarter of a pixel to either side
             shift_x, shift_y = across[0] >> 2, across[1] >> 2
-            color = (interpolate(texels, palette, x - shift_x, y - shift_y) >> np.uint64(1)) & HALVES
-            more = interpolate(texels, palette, x + shift_x, y + shift_y)
-            color += (more >> np.uint64(1)) & HALVES
+            left = interpolate(texels, palette, x - shift_x, y - shift_y)
+            right = interpolate(texels, palette, x + shift_x, y + shift_y)
+            color = ((left >> np.uint64(1)) & HALVES) + ((right >> np.uint64(1)) & HALVES)
         write(pixels, np.uint64(3) * np.uint64(pixel), color)
 
 
@@ -703,15 +708,15 @@ def draw_car(out, pictures, wheels, zoom, corner):
     Args:
         out: uint8 (rows, columns, 3).
         pictures: the Pictures.
-        wheels: float64 (4, 3), for each wheel its angle to the hull, its rotation (both radians) and
-            its speed of rotation.
+        wheels: float64 (4, 3), for each wheel its angle to the hull, its rotation (both radians)
+            and its speed of rotation.
         zoom: window pixels per world unit.
         corner: row and column of the observation where `out` begins, floats.
     """
     drawn = np.empty((QUARTER_ROWS, QUARTER_COLUMNS, 4), np.uint8)
     for place in range(4):
-        turn = min(max(round(wheels[place, 0] * TURN_STEPS), -MAX_TURN), MAX_TURN)
-        phase = int(math.floor(wheels[place, 1] * PHASE_STEPS / math.tau)) % PHASE_STEPS
+        turn = round(TURN_STEPS * min(max(wheels[place, 0], -LARGEST_TURN), LARGEST_TURN))
+        phase = int(wheels[place, 1] % math.tau * PHASE_STEPS / math.tau) % PHASE_STEPS
         if zoom == ZOOM:
             quarter = pictures.car[place, turn + MAX_TURN, phase]
         else:  # in the opening second
@@ -765,7 +770,7 @@ def draw_quarter(quarter, place, turn, phase, zoom):
 
 @compiled
 def wheel_stripe(phase):
-    """The light stripe on a turning wheel: its ends along the wheel, in radii; (1, -1) if hidden."""
+    """Ends of the light stripe on a turning wheel, in radii along it; (1, -1) if hidden."""
     sin1, sin2 = math.sin(phase), math.sin(phase + 1.2)
     cos1, cos2 = math.cos(phase), math.cos(phase + 1.2)
     if sin1 > 0 and sin2 > 0:
@@ -862,7 +867,8 @@ def draw_bar(out, score, speed, spin, wheels, reward):
     Args:
         out: uint8 (rows, columns, 3), an observation or a frame with its indicator bar.
         score: uint8 (n, rows of the bar, columns), the pictures of the score.
-        speed: of the hull, world units per second; `spin`: its angular velocity, radians per second.
+        speed: of the hull, world units per second.
+        spin: its angular velocity, radians per second.
         wheels: float64 (4, 3), angle to the hull, rotation and speed of rotation of each wheel.
         reward: so far.
     """
@@ -891,19 +897,19 @@ def score_index(reward):
 
 @compiled
 def draw_upright(out, place, length, value, red, green, blue):
-    """A vertical indicator: `place` in fortieths of the width, `length` in fortieths of the height."""
+    """A vertical indicator, `place` / 40 of the width from the left, `length` / 40 of the height."""
     if abs(value) > 1e-4:
         unit, end = WINDOW_W / 40, WINDOW_H - WINDOW_H / 40
-        top = float(math.trunc(end - length * WINDOW_H / 40))
+        top = np.trunc(end - length * WINDOW_H / 40)
         draw_rectangle(out, place * unit, (place + 1) * unit, top, end, red, green, blue)
 
 
 @compiled
 def draw_sideways(out, place, length, value, red, green):
-    """A horizontal indicator: `place` and `length` in fortieths of the width."""
+    """A horizontal indicator, `place` / 40 of the width from the left, `length` / 40 of it."""
     if abs(value) > 1e-4:
         begin, unit = place * WINDOW_W / 40, WINDOW_H / 40
-        end = float(math.trunc((place + length) * WINDOW_W / 40))
+        end = np.trunc((place + length) * WINDOW_W / 40)
         draw_rectangle(out, begin, end, WINDOW_H - 4 * unit, WINDOW_H - 2 * unit, red, green, 0.0)
 
 
@@ -932,6 +938,17 @@ def draw_rectangle(out, x1, x2, y1, y2, red, green, blue):
 # Whole pictures
 
 
+@compiled
+def all_finite(hull, wheels, reward):
+    """Whether no number of the car's state is infinite or NaN."""
+    total = reward
+    for i in range(len(hull)):
+        total += hull[i]
+    for i in range(len(wheels)):
+        total += wheels[i, 0] + wheels[i, 1] + wheels[i, 2]
+    return math.isfinite(total)
+
+
 @merged
 def draw_picture(out, ground, pictures, car, hull, wheels, reward, time, bar):
     """Draw the observation or the agent's frame of one car.
@@ -948,9 +965,14 @@ def draw_picture(out, ground, pictures, car, hull, wheels, reward, time, bar):
             speed of rotation (radians per second).
         reward: so far in the episode.
         time: since its start, seconds.
-        bar: whether to draw the indicator bar. Without it the rows of the observation are black, and
-            the frame shows the rest, stretched to its height.
+        bar: whether to draw the indicator bar. Without it the rows of the observation are black,
+            and the frame shows the rest, stretched to its height.
+
+    A state that is not finite gives a black picture.
     """
+    if not all_finite(hull, wheels, reward):  # the physics has failed; there is nothing to see
+        out[:] = 0
+        return
     whole = out.shape[0] == OBSERVATION_SIZE
     columns = OBSERVATION_SIZE / out.shape[1]  # of the observation to one column of this picture
     rows = columns if whole or bar else BAR_TOP / out.shape[0]
@@ -1033,4 +1055,3 @@ def score_picture(font: pygame.font.Font, text: str) -> np.ndarray:
     surface.blit(label, label.get_rect(center=(60, WINDOW_H * 2.5 / 40)))
     small = pygame.transform.smoothscale(surface, (SCORE_COLUMNS, BAR_ROWS))
     return pygame.surfarray.array3d(small)[:, :, 0].T
-
