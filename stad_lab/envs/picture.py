@@ -20,8 +20,8 @@ tells whether interpolation is needed. In the opening zoom a pixel covers many t
 them all would be slow, so there are copies of the texture at 1/4, 1/8 and 1/16 of its size, in
 colour (*mip levels*), and a picture uses the copy with about two texels per pixel.
 
-`draw_picture` makes the full observation, uint8 (96, 96, 3), or the agent's frame, uint8
-(64, 64, 3), straight from the texture. Everything is compiled by Numba and releases the GIL; nothing
+`draw_picture` makes the observation, uint8 (96, 96, 3), or the agent's frame, uint8 (64, 64, 3),
+straight from the texture. Everything is compiled by Numba and releases the GIL; nothing
 here knows Box2D. Images are indexed [row, column]; the texture's rows follow the world's y axis
 upward, its columns the x axis.
 
@@ -897,7 +897,7 @@ def score_index(reward):
 
 @compiled
 def draw_upright(out, place, length, value, red, green, blue):
-    """A vertical indicator, `place` / 40 of the width from the left, `length` / 40 of the height."""
+    """A vertical indicator, `place` / 40 of the width from the left, `length` / 40 high."""
     if abs(value) > 1e-4:
         unit, end = WINDOW_W / 40, WINDOW_H - WINDOW_H / 40
         top = np.trunc(end - length * WINDOW_H / 40)
