@@ -44,7 +44,7 @@ class Painter:
 
     def draw(self, size, bar=True):
         """The observation (size 96) or the agent's frame (size 64) of this moment."""
-        visited = np.array([tile.road_visited for tile in self.env.road])
+        visited = np.array([tile.road_visited for tile in self.env.road], bool)
         for tile in np.flatnonzero(visited & ~self.visited):
             picture.visit(self.ground, 0, self.tiles[tile])
         self.visited = visited
