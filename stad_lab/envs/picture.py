@@ -1,4 +1,4 @@
-"""Pictures of CarRacing: a texture of the track, one affine warp, the car and the indicator bar on top.
+"""Pictures of CarRacing: a texture of the track, one affine warp, then the car and the bar.
 
 Gymnasium draws some 800 polygons on 1000 x 800 window pixels for every observation and shrinks the
 result to 96 x 96. But the ground hardly changes within an episode, and the camera is fixed to the
@@ -20,8 +20,8 @@ tells whether interpolation is needed. In the opening zoom a pixel covers many t
 them all would be slow, so there are copies of the texture at 1/4, 1/8 and 1/16 of its size, in
 colour (*mip levels*), and a picture uses the copy with about two texels per pixel.
 
-`draw_picture` makes the full observation, uint8 (96, 96, 3), or the agent's frame, uint8 (64, 64, 3),
-the latter straight from the texture. Everything is compiled by Numba and releases the GIL; nothing
+`draw_picture` makes the observation, uint8 (96, 96, 3), or the agent's frame, uint8 (64, 64, 3),
+straight from the texture. Everything is compiled by Numba and releases the GIL; nothing
 here knows Box2D. Images are indexed [row, column]; the texture's rows follow the world's y axis
 upward, its columns the x axis.
 
@@ -57,13 +57,11 @@ ZOOM = reference.ZOOM * reference.SCALE  # window pixels per world unit, after t
 DARKENING = 2  # pygame's smoothscale loses two levels of every channel to its fixed-point sums
 
 # The texture.
-FIELD = 1920  # texels, width and height of the field
+FIELD = 1920  # texels, width and height of the field: 1.9 to a pixel of the observation
 CELL = 16  # texels: the texture is restored and shrunk in cells of this size
 RIM = CELL  # texels of black around the field
 SIZE = FIELD + 2 * RIM  # texels, width and height of the texture
-SCALE = FIELD / (
-    2 * reference.PLAYFIELD
-)  # texels per world unit: 1.9 to a pixel of the observation
+SCALE = FIELD / (2 * reference.PLAYFIELD)  # texels per world unit
 ORIGIN = SIZE / 2  # x and y of the world's origin, texels
 PERIOD = FIELD // 20  # texels from one grass square to the next
 CELLS = SIZE // CELL
@@ -85,32 +83,27 @@ HALVES = np.uint64(0x7FFF7FFF7FFF)  # the lanes of 256 times a colour that has b
 ROUND = np.uint64(0x008000800080)  # rounds 256 times a colour to the nearest level
 FRACTION = 16  # positions on the texture are fixed-point numbers with so many binary digits
 ONE = 1 << FRACTION
-BLOCK = 16  # pixels that are searched for flags at a time
+BLOCK = 8  # pixels that are searched for flags at a time
 
 # The car. The hull's origin lies at a corner between four pixels of the observation.
 HULL_ROW, HULL_COLUMN = 72, 48
 QUARTER_ROWS, QUARTER_COLUMNS = 6, 4  # pixels, size of a quarter of the car
-CANVAS_ROWS = math.ceil(
-    QUARTER_ROWS * PIXEL_H
-)  # a quarter is drawn in window pixels, then averaged
+CANVAS_ROWS = math.ceil(QUARTER_ROWS * PIXEL_H)  # of the window, in which a quarter is drawn
 CANVAS_COLUMNS = math.ceil(QUARTER_COLUMNS * PIXEL_W)
 TURN_STEPS, MAX_TURN = 24, 12  # a wheel's angle to the hull: steps of 1/24 rad, at most 12 of them
+LARGEST_TURN = MAX_TURN / TURN_STEPS  # radians
 PHASE_STEPS = 32  # a wheel's rotation: steps of 2 pi / 32
 CORNERS = 8  # of a polygon of the car; those with fewer corners repeat the last
-HULL_POLYGONS = (
-    np.array(  # world units
-        [
-            polygon + polygon[-1:] * (CORNERS - len(polygon))
-            for polygon in (
-                car_dynamics.HULL_POLY1,
-                car_dynamics.HULL_POLY2,
-                car_dynamics.HULL_POLY3,
-                car_dynamics.HULL_POLY4,
-            )
-        ]
+HULL_POLYGONS = [
+    polygon + polygon[-1:] * (CORNERS - len(polygon))
+    for polygon in (
+        car_dynamics.HULL_POLY1,
+        car_dynamics.HULL_POLY2,
+        car_dynamics.HULL_POLY3,
+        car_dynamics.HULL_POLY4,
     )
-    * float(car_dynamics.SIZE)
-)
+]
+HULL_POLYGONS = np.array(HULL_POLYGONS) * car_dynamics.SIZE  # (4, CORNERS, 2), world units
 WHEEL_PLACES = np.array(car_dynamics.WHEELPOS) * car_dynamics.SIZE  # world units
 WHEEL_HALF_WIDTH = car_dynamics.WHEEL_W * car_dynamics.SIZE
 WHEEL_RADIUS = car_dynamics.WHEEL_R * car_dynamics.SIZE
@@ -138,6 +131,7 @@ class Ground(NamedTuple):
         texels: uint8 (cars, SIZE, SIZE), kinds, shades and flags.
         quarter, eighth, sixteenth: uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours
             (red in the lowest byte).
+        colors: uint8 (cars, 8, 3), in the order of TEXELS.
         palette: uint64 (cars, 256), the colour of each texel in 16-bit lanes.
         cells: uint8 (cars, CELLS, CELLS), HAS_ROAD where a road polygon may have painted.
         pattern: uint8 (PERIOD, PERIOD), texels of background and grass without a road.
@@ -147,6 +141,7 @@ class Ground(NamedTuple):
     quarter: np.ndarray
     eighth: np.ndarray
     sixteenth: np.ndarray
+    colors: np.ndarray
     palette: np.ndarray
     cells: np.ndarray
     pattern: np.ndarray
@@ -161,6 +156,7 @@ def make_ground(cars: int) -> Ground:
         quarter=np.zeros((cars, SIZE // 4, SIZE // 4), np.uint32),
         eighth=np.zeros((cars, SIZE // 8, SIZE // 8), np.uint32),
         sixteenth=np.zeros((cars, SIZE // 16, SIZE // 16), np.uint32),
+        colors=np.zeros((cars, len(TEXELS), 3), np.uint8),
         palette=np.zeros((cars, 256), np.uint64),
         cells=np.zeros((cars, CELLS, CELLS), np.uint8),
         pattern=field[first : first + PERIOD, first : first + PERIOD].copy(),
@@ -209,7 +205,7 @@ def paint(ground, car, road, kinds, colors):
         fill_polygon(texels, corners, kinds[number])
         mark_cells(cells, corners)
     mark_edges(texels, cells)
-    new_colors = set_palette(ground.palette[car], colors)
+    new_colors = set_palette(ground.palette[car], ground.colors[car], colors)
     shrink(ground, car, new_colors)
 
 
@@ -297,7 +293,7 @@ def visit(ground, car, tile):
 
 @compiled
 def mark_cells(cells, corners):
-    """Mark the cells around a polygon, corners in texels; 3 more texels hold all flags it causes."""
+    """Mark the cells around a polygon, corners in texels, with room for the flags it causes."""
     left, right, low, high = bounds(corners)
     for i in range(max(0, int(low - 3) // CELL), min(CELLS, int(high + 3) // CELL + 1)):
         for j in range(max(0, int(left - 3) // CELL), min(CELLS, int(right + 3) // CELL + 1)):
@@ -360,14 +356,21 @@ def mark_near_row(below, line, above, around):
 
 
 @compiled
-def set_palette(palette, colors):
-    """Spread the colours, uint8 (8, 3), to a palette, uint64 (256,); are there new ones?"""
+def set_palette(palette, own, colors):
+    """Store the colours, uint8 (8, 3), and make the palette; returns whether they are new.
+
+    Args:
+        palette: uint64 (256,), to write; `own`: uint8 (8, 3), to write.
+        colors: uint8 (8, 3).
+    """
     new = False
-    for flags in range(0, 256, 32):
-        for i in range(len(TEXELS)):
-            value = np.uint64(colors[i, 0]) | np.uint64(colors[i, 1]) << np.uint64(16)
-            value |= np.uint64(colors[i, 2]) << np.uint64(32)
-            new |= palette[flags + TEXELS[i]] != value
+    for i in range(len(TEXELS)):
+        value = np.uint64(0)
+        for channel in range(3):
+            new |= own[i, channel] != colors[i, channel]
+            own[i, channel] = colors[i, channel]
+            value |= np.uint64(colors[i, channel]) << np.uint64(16 * channel)
+        for flags in range(0, 256, 32):
             palette[flags + TEXELS[i]] = value
     return new
 
@@ -442,8 +445,8 @@ def look(out, ground, car, pose, zoom, pixel, corner):
 
     Args:
         out: uint8 (rows, columns, 3), the picture or a part of it.
-        pose: x, y and angle of the hull, which stands in the middle of the window, three quarters of
-            its height below the upper edge; the camera turns with it.
+        pose: x, y and angle of the hull, which stands in the middle of the window, three quarters
+            of its height below the upper edge; the camera turns with it.
         zoom: window pixels per world unit.
         pixel: width and height of a pixel of the picture, in window pixels.
         corner: row and column of the picture where `out` begins, floats.
@@ -473,7 +476,7 @@ def look(out, ground, car, pose, zoom, pixel, corner):
 @compiled
 def to_fixed(position):
     """A position or step in texels as a fixed-point number, int64."""
-    return int(math.floor(min(max(position, -1e9), 1e9) * ONE))
+    return math.floor(min(max(position, -1e9), 1e9) * ONE)
 
 
 @compiled
@@ -504,7 +507,7 @@ def columns_on_texture(x, y, across, columns, size):
     low, inner = margin * ONE, size - 1 - 2 * margin
     first_x, end_x = columns_inside(x - low, across[0], columns, inner)
     first_y, end_y = columns_inside(y - low, across[1], columns, inner)
-    first = max(first_x, first_y)
+    first = min(max(first_x, first_y), columns)
     return first, max(first, min(end_x, end_y))
 
 
@@ -520,13 +523,13 @@ def warp_texels(out, ground, car, start, across, down, fine):
     rows, columns = out.shape[0], out.shape[1]
     pixels, texels = out.reshape(-1), ground.texels[car].reshape(-1)
     palette = ground.palette[car]
-    nearest = np.empty(rows * columns, np.uint8)  # the texel of each pixel
+    nearest = np.zeros(rows * columns + BLOCK, np.uint8)  # the texel of each pixel
     for row in range(rows):
         x, y = start[0] + row * down[0], start[1] + row * down[1]
         first, end = columns_on_texture(x, y, across, columns, ground.texels.shape[1])
         line = nearest[row * columns : (row + 1) * columns]
         read_texels(line, texels, x, y, across, first, end)
-    write_colors(pixels, nearest, palette)
+    write_colors(pixels, nearest, ground.colors[car])
     smooth_edges(pixels, nearest, texels, palette, columns, start, across, down, fine)
 
 
@@ -552,16 +555,15 @@ def read_texels(line, texels, x, y, across, first, end):
 
 
 @compiled
-def write_colors(pixels, nearest, palette):
-    """Turn texels, uint8 (n,), into colours, uint8 (3 n,): red, green, blue, red, ...
+def write_colors(pixels, nearest, colors):
+    """Turn the texels of pixels into colours, uint8 (3 n,): red, green, blue, red, ...
 
     Selections instead of a table: so the loop compiles to vector instructions, 64 pixels at once.
     """
-    background, grass = channels(palette[BACKGROUND]), channels(palette[GRASS])
-    road_0, road_1 = channels(palette[ROAD]), channels(palette[ROAD + 1])
-    road_2, outside = channels(palette[ROAD + 2]), channels(palette[OUTSIDE])
-    white, red = channels(palette[WHITE]), channels(palette[RED])
-    for i in range(len(nearest)):
+    background, grass, road_0 = row_of(colors, 0), row_of(colors, 1), row_of(colors, 2)
+    road_1, road_2, white = row_of(colors, 3), row_of(colors, 4), row_of(colors, 5)
+    red, outside = row_of(colors, 6), row_of(colors, 7)
+    for i in range(len(pixels) // 3):
         texel = np.uint8(nearest[i] & KIND_AND_SHADE)
         color = background
         color = grass if texel == GRASS else color
@@ -575,6 +577,12 @@ def write_colors(pixels, nearest, palette):
         pixels[place] = color[0]
         pixels[place + np.uint64(1)] = color[1]
         pixels[place + np.uint64(2)] = color[2]
+
+
+@merged
+def row_of(colors, i):
+    """Red, green and blue of colour i, as a tuple."""
+    return colors[i, 0], colors[i, 1], colors[i, 2]
 
 
 @compiled
@@ -592,18 +600,17 @@ def find_flagged(found, nearest, flag):
     processor may predict wrongly.
 
     Args:
-        found: uint16 (n + BLOCK,), to write.
-        nearest: uint8 (n,), the texels.
+        found: uint16 (n,), to write.
+        nearest: uint8 (n,), the texels and, at the end, BLOCK zeros.
         flag: uint8.
     """
     count = np.uint64(0)
-    for first in range(0, len(nearest), BLOCK):
+    for first in range(0, len(nearest) - BLOCK, BLOCK):
         flags = np.uint8(0)
-        end = min(first + BLOCK, len(nearest))
-        for i in range(first, end):
-            flags |= nearest[np.uint64(i)]
+        for i in range(BLOCK):
+            flags = np.uint8(flags | nearest[np.uint64(first + i)])
         if flags & flag:
-            for i in range(first, end):
+            for i in range(first, first + BLOCK):
                 found[count] = i
                 count += np.uint64((nearest[np.uint64(i)] & flag) != 0)
     return count
@@ -615,12 +622,12 @@ def smooth_edges(pixels, nearest, texels, palette, columns, start, across, down,
 
     Args:
         pixels: uint8 (3 n,), to write.
-        nearest: uint8 (n,), the texel of each pixel.
+        nearest: uint8 (n + BLOCK,), the texel of each pixel, and zeros.
         texels: uint8 (SIZE * SIZE,); `palette`: uint64 (256,).
         columns: of the picture.
         start, across, down, fine: as in `warp_texels`.
     """
-    found = np.empty(len(nearest) + BLOCK, np.uint16)
+    found = np.empty(len(nearest), np.uint16)
     for i in range(find_flagged(found, nearest, np.uint8(EDGE if fine else NEAR))):
         pixel = np.uint32(found[i])
         row = np.int64(np.uint32(pixel // np.uint32(columns)))
@@ -631,11 +638,9 @@ def smooth_edges(pixels, nearest, texels, palette, columns, start, across, down,
             color = interpolate(texels, palette, x, y)
         else:  # the mean of two, a quarter of a pixel to either side
             shift_x, shift_y = across[0] >> 2, across[1] >> 2
-            color = (
-                interpolate(texels, palette, x - shift_x, y - shift_y) >> np.uint64(1)
-            ) & HALVES
-            more = interpolate(texels, palette, x + shift_x, y + shift_y)
-            color += (more >> np.uint64(1)) & HALVES
+            left = interpolate(texels, palette, x - shift_x, y - shift_y)
+            right = interpolate(texels, palette, x + shift_x, y + shift_y)
+            color = ((left >> np.uint64(1)) & HALVES) + ((right >> np.uint64(1)) & HALVES)
         write(pixels, np.uint64(3) * np.uint64(pixel), color)
 
 
@@ -703,15 +708,15 @@ def draw_car(out, pictures, wheels, zoom, corner):
     Args:
         out: uint8 (rows, columns, 3).
         pictures: the Pictures.
-        wheels: float64 (4, 3), for each wheel its angle to the hull, its rotation (both radians) and
-            its speed of rotation.
+        wheels: float64 (4, 3), for each wheel its angle to the hull, its rotation (both radians)
+            and its speed of rotation.
         zoom: window pixels per world unit.
         corner: row and column of the observation where `out` begins, floats.
     """
     drawn = np.empty((QUARTER_ROWS, QUARTER_COLUMNS, 4), np.uint8)
     for place in range(4):
-        turn = min(max(round(wheels[place, 0] * TURN_STEPS), -MAX_TURN), MAX_TURN)
-        phase = int(math.floor(wheels[place, 1] * PHASE_STEPS / math.tau)) % PHASE_STEPS
+        turn = round(TURN_STEPS * min(max(wheels[place, 0], -LARGEST_TURN), LARGEST_TURN))
+        phase = int(wheels[place, 1] % math.tau * PHASE_STEPS / math.tau) % PHASE_STEPS
         if zoom == ZOOM:
             quarter = pictures.car[place, turn + MAX_TURN, phase]
         else:  # in the opening second
@@ -765,7 +770,7 @@ def draw_quarter(quarter, place, turn, phase, zoom):
 
 @compiled
 def wheel_stripe(phase):
-    """The light stripe on a turning wheel: its ends along the wheel, in radii; (1, -1) if hidden."""
+    """Ends of the light stripe on a turning wheel, in radii along it; (1, -1) if hidden."""
     sin1, sin2 = math.sin(phase), math.sin(phase + 1.2)
     cos1, cos2 = math.cos(phase), math.cos(phase + 1.2)
     if sin1 > 0 and sin2 > 0:
@@ -862,7 +867,8 @@ def draw_bar(out, score, speed, spin, wheels, reward):
     Args:
         out: uint8 (rows, columns, 3), an observation or a frame with its indicator bar.
         score: uint8 (n, rows of the bar, columns), the pictures of the score.
-        speed: of the hull, world units per second; `spin`: its angular velocity, radians per second.
+        speed: of the hull, world units per second.
+        spin: its angular velocity, radians per second.
         wheels: float64 (4, 3), angle to the hull, rotation and speed of rotation of each wheel.
         reward: so far.
     """
@@ -891,19 +897,19 @@ def score_index(reward):
 
 @compiled
 def draw_upright(out, place, length, value, red, green, blue):
-    """A vertical indicator: `place` in fortieths of the width, `length` in fortieths of the height."""
+    """A vertical indicator, `place` / 40 of the width from the left, `length` / 40 high."""
     if abs(value) > 1e-4:
         unit, end = WINDOW_W / 40, WINDOW_H - WINDOW_H / 40
-        top = float(math.trunc(end - length * WINDOW_H / 40))
+        top = np.trunc(end - length * WINDOW_H / 40)
         draw_rectangle(out, place * unit, (place + 1) * unit, top, end, red, green, blue)
 
 
 @compiled
 def draw_sideways(out, place, length, value, red, green):
-    """A horizontal indicator: `place` and `length` in fortieths of the width."""
+    """A horizontal indicator, `place` / 40 of the width from the left, `length` / 40 of it."""
     if abs(value) > 1e-4:
         begin, unit = place * WINDOW_W / 40, WINDOW_H / 40
-        end = float(math.trunc((place + length) * WINDOW_W / 40))
+        end = np.trunc((place + length) * WINDOW_W / 40)
         draw_rectangle(out, begin, end, WINDOW_H - 4 * unit, WINDOW_H - 2 * unit, red, green, 0.0)
 
 
@@ -932,6 +938,17 @@ def draw_rectangle(out, x1, x2, y1, y2, red, green, blue):
 # Whole pictures
 
 
+@compiled
+def all_finite(hull, wheels, reward):
+    """Whether no number of the car's state is infinite or NaN."""
+    total = reward
+    for i in range(len(hull)):
+        total += hull[i]
+    for i in range(len(wheels)):
+        total += wheels[i, 0] + wheels[i, 1] + wheels[i, 2]
+    return math.isfinite(total)
+
+
 @merged
 def draw_picture(out, ground, pictures, car, hull, wheels, reward, time, bar):
     """Draw the observation or the agent's frame of one car.
@@ -948,9 +965,14 @@ def draw_picture(out, ground, pictures, car, hull, wheels, reward, time, bar):
             speed of rotation (radians per second).
         reward: so far in the episode.
         time: since its start, seconds.
-        bar: whether to draw the indicator bar. Without it the rows of the observation are black, and
-            the frame shows the rest, stretched to its height.
+        bar: whether to draw the indicator bar. Without it the rows of the observation are black,
+            and the frame shows the rest, stretched to its height.
+
+    A state that is not finite gives a black picture.
     """
+    if not all_finite(hull, wheels, reward):  # the physics has failed; there is nothing to see
+        out[:] = 0
+        return
     whole = out.shape[0] == OBSERVATION_SIZE
     columns = OBSERVATION_SIZE / out.shape[1]  # of the observation to one column of this picture
     rows = columns if whole or bar else BAR_TOP / out.shape[0]
