@@ -183,7 +183,8 @@ def run_stages(
     """Run some stages in order and keep the record of the run; False if nothing was to do."""
     worked = False
     with locked(folder):
-        record = open_record(config, folder, before)
+        command = command_of(config) if data else fine_tuning_command(config)
+        record = open_record(config, folder, before, command)
         for name, stage in stages.items():
             with timed(record, name, folder) as note:
                 try:
@@ -199,7 +200,8 @@ def run_stages(
             print(f"{name}: {'done' if did else 'already there, nothing to do'}", flush=True)
             worked |= did
         record["budget"] = budget(config, folder, data)
-        save_json(folder / RECORD, record)
+        if worked or load_json(folder / RECORD) != record:
+            save_json(folder / RECORD, record)
     return worked
 
 
@@ -229,13 +231,13 @@ def timed(record: dict, stage: str, folder: Path) -> Iterator[Callable[[], None]
         thread.join()
 
 
-def open_record(config: Config, folder: Path, before: dict | None) -> dict:
+def open_record(config: Config, folder: Path, before: dict | None, command: str) -> dict:
     """The record of the run in `folder`, or a new one.
 
     "made_with" is that of the first start; a later one on another machine or with other versions
     is added to "continued_with". "earlier" is the record of the run that this one continues.
     """
-    path, made = folder / RECORD, provenance(command_of(config))
+    path, made = folder / RECORD, provenance(command)
     new = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
     if not path.exists():
         earlier = {} if before is None else {"earlier": before}
@@ -279,20 +281,31 @@ def command_of(config: Config) -> str:
         name: changes(config, Config.preset(name, variant=config.variant)) for name in PRESETS
     }
     name = min(changed, key=lambda name: len(changed[name]))
-    options = [f"--{option} {shlex.quote(str(value))}" for option, value in changed[name].items()]
+    options = [option_of(*change) for change in changed[name].items()]
     command = f"python -m stad_lab train {name} --variant {config.variant} --out ..."
     earlier = ["--earlier ..."] if config.data.agent_episodes else []
     return " ".join([command, *options, *earlier])
 
 
+def fine_tuning_command(config: Config) -> str:
+    """The command line that makes a fine-tuning of this configuration."""
+    names = ("generations", "sigma", "seed")
+    options = [option_of(name, getattr(config.evolution, name)) for name in names]
+    return " ".join(["python -m stad_lab fine-tune --run ... --out ...", *options])
+
+
 def changes(config: Config, usual: Config) -> dict:
-    """Dotted command-line names and values of the fields that differ from `usual`."""
+    """Dotted names and values of the fields that differ from `usual`."""
     before = {name: value for name, _, value in fields_of(usual)}
-    return {
-        name.replace("_", "-"): value
-        for name, _, value in fields_of(config)
-        if value != before[name]
-    }
+    return {name: value for name, _, value in fields_of(config) if value != before[name]}
+
+
+def option_of(name: str, value: object) -> str:
+    """The command-line option that gives a field its value."""
+    stage, dot, field = name.replace("_", "-").rpartition(".")
+    if isinstance(value, bool):
+        return f"--{stage}{dot}{'' if value else 'no-'}{field}"
+    return f"--{stage}{dot}{field} {shlex.quote(str(value))}"
 
 
 def provenance(command: str) -> dict:
