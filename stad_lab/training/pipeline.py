@@ -181,7 +181,8 @@ def run_stages(
     """Run some stages in order and keep the record of the run; False if nothing was to do."""
     worked = False
     with locked(folder):
-        record = open_record(config, folder, before)
+        command = command_of(config) if data else fine_tuning_command(config)
+        record = open_record(config, folder, before, command)
         for name, stage in stages.items():
             with timed(record, name, folder) as note:
                 try:
@@ -228,13 +229,13 @@ def timed(record: dict, stage: str, folder: Path) -> Iterator[Callable[[], None]
         thread.join()
 
 
-def open_record(config: Config, folder: Path, before: dict | None) -> dict:
+def open_record(config: Config, folder: Path, before: dict | None, command: str) -> dict:
     """The record of the run in `folder`, or a new one.
 
     "made_with" is that of the first start; a later one on another machine or with other versions
     is added to "continued_with". "earlier" is the record of the run that this one continues.
     """
-    path, made = folder / RECORD, provenance(command_of(config))
+    path, made = folder / RECORD, provenance(command)
     new = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
     if not path.exists():
         earlier = {} if before is None else {"earlier": before}
@@ -284,6 +285,13 @@ def command_of(config: Config) -> str:
     command = f"python -m stad_lab train {name} --variant {config.variant} --out ..."
     earlier = ["--earlier ..."] if config.data.agent_episodes else []
     return " ".join([command, *options, *earlier])
+
+
+def fine_tuning_command(config: Config) -> str:
+    """The command line that makes a fine-tuning of this configuration."""
+    names = ("generations", "sigma", "seed")
+    options = [option_of(name, getattr(config.evolution, name)) for name in names]
+    return " ".join(["python -m stad_lab fine-tune --run ... --out ...", *options])
 
 
 def changes(config: Config, usual: Config) -> dict:

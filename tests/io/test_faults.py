@@ -665,7 +665,7 @@ def test_a_commit_is_only_that_of_the_checkout_in_which_the_library_is(tmp_path,
 
 def test_a_run_that_is_made_longer_has_the_new_configuration_in_its_record(quick_run):
     longer = QUICK.replace(evolution={"generations": 8})
-    assert pipeline.open_record(longer, quick_run, None)["config"] == longer.as_dict()
+    assert pipeline.open_record(longer, quick_run, None, "")["config"] == longer.as_dict()
 
 
 def run_stage(stage, folder, executor):
