@@ -34,6 +34,15 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
 
 
+def place_car(env: gym.Env, tile: int, **how) -> np.ndarray:
+    """Put the car of `make_env()` on a tile, moving; returns the observation there.
+
+    Args:
+        **how: speed, turn and offset, as for `Cars.place`.
+    """
+    return env.unwrapped.place(tile, **how)
+
+
 def spaces(continuous: bool = True) -> tuple[gym.Space, gym.Space]:
     """The observation space and the action space of one car, as Gymnasium's."""
     seen = gym.spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
@@ -108,6 +117,16 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         info = {"lap_finished": bool(ending == physics.LAP_FINISHED)} if ended[0] else {}
         self._show()
         return self.cars.draw()[0], float(rewards[0]), bool(ended[0]), False, info
+
+    @property
+    def track(self) -> np.ndarray:
+        """The centre line, float64 (tiles, 4): angle from the origin, heading, x and y."""
+        return self.cars.tracks[0].path
+
+    @property
+    def position(self) -> np.ndarray:
+        """Where the hull is, world units, float64 (2,)."""
+        return self.cars.cars["position"][0, 0].astype(float)
 
     def place(self, tile: int, **how) -> np.ndarray:
         """Put the car on a tile, as `Cars.place`; returns the observation there."""
