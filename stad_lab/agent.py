@@ -132,7 +132,7 @@ class Agent:
 
 
 class Driver(Protocol):
-    """What `rollout` needs of a driver: an Agent, or anything else that acts."""
+    """What `rollout` needs: an Agent, or anything else that acts."""
 
     def reset(self) -> None:
         """Begin new episodes."""
@@ -147,12 +147,9 @@ class Driver(Protocol):
 class Episodes(NamedTuple):
     """What `rollout` returns."""
 
-    returns: np.ndarray
-    """float64 (episodes,)."""
-    lengths: np.ndarray
-    """Frames, int (episodes,)."""
-    rewards: list[list[float]]
-    """Of every frame, for each episode."""
+    returns: np.ndarray  # float64 (episodes,)
+    lengths: np.ndarray  # frames, int (episodes,)
+    rewards: list[list[float]]  # of every frame, for each episode
 
 
 Observe = Callable[[int, gym.Env, np.ndarray, np.ndarray], None]
@@ -193,8 +190,7 @@ def rollout(
             returns[car] += reward
             rewards[car].append(reward)
             length = len(rewards[car])
-            if reward > 0:
-                last_tile[car] = length
+            last_tile[car] = length if reward > 0 else last_tile[car]
             lost = patience and length - last_tile[car] >= patience
             if terminated or truncated or lost or length >= max_frames:
                 envs[car].close()  # releases its painted track
@@ -242,12 +238,7 @@ def encode_episode(vae: VAE, frames: np.ndarray, stride: int) -> np.ndarray:
 def remember_episode(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """M's memory before every frame of an episode, which C sees with that frame's z.
 
-    Args:
-        latents: float32 (T, latent_size).
-        actions: float32 (T, 3).
-
-    Returns:
-        float32 (T, hidden_size); zero in the first row.
+    float32 (T, latent_size) and (T, 3) -> (T, hidden_size); the first row is zero.
     """
     after, _ = mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None])
     return torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)[0].numpy()
