@@ -12,7 +12,7 @@ from safetensors.numpy import load_file
 
 from stad_lab.agent import features_of, load_agent
 from stad_lab.config import TRACK_RANGES, Config, track_seeds
-from stad_lab.envs.car_racing import make_env
+from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import to_frame
 from stad_lab.evaluation.verify import verify
 from stad_lab.io.files import load_json, save_json
@@ -194,16 +194,15 @@ def test_noise_is_correlated_in_time_and_its_strength_differs_between_episodes(a
     strengths = []
     for episode in range(3):
         frames, actions, track = drive_noisily(agent, CONFIG, episode)
-        env, noise = make_env(fast=True), []
-        observation, _ = env.reset(seed=track)
+        cars, noise = Cars(1, "frame", bar=not CONFIG.data.crop_bar), []
+        cars.reset([track])
         agent.reset()
         for frame, action in zip(frames, actions, strict=True):
-            assert np.array_equal(frame, to_frame(observation, CONFIG.data.crop_bar))
-            before, meant = agent.state, agent.act(observation)
+            assert np.array_equal(frame, cars.draw()[0])
+            before, meant = agent.state, agent.act_batch(frame[None])[0]
             agent.remember(action[None], before)
             noise.append(action[0] - meant[0])
-            observation, *_ = env.step(action)
-        env.close()
+            cars.step(action[None])
         strengths.append(np.std(noise))
         assert np.corrcoef(noise[1:], noise[:-1])[0, 1] > 0.5
     assert min(strengths) > 1e-3 and max(strengths) > 1.5 * min(strengths)
@@ -213,10 +212,9 @@ def test_a_noisy_episode_ends_after_the_patience_without_a_new_tile(agent):
     impatient = CONFIG.replace(data={"agent_patience": 13})
     patient = CONFIG.replace(data={"agent_patience": 0})
     ended, (_, actions, track) = (drive_noisily(agent, one, 0) for one in (impatient, patient))
-    env = make_env()
-    env.reset(seed=track)
-    reached = [t for t, action in enumerate(actions, 1) if env.step(action)[1] > 0]
-    env.close()
+    cars = Cars(1)
+    cars.reset([track])
+    reached = [t for t, action in enumerate(actions, 1) if cars.step(action[None])[0] > 0]
     last = next(t for t, following in itertools.pairwise([0, *reached, 1000]) if following - t > 13)
     assert len(ended[0]) == min(60, last + 13) > 13
 
