@@ -12,7 +12,6 @@ import torch
 from safetensors.torch import save_file
 
 from stad_lab import Agent, load_agent, make_env
-from stad_lab.envs.cars import Cars
 from stad_lab.agent import (
     PRETRAINED,
     drive,
@@ -25,6 +24,7 @@ from stad_lab.agent import (
     shipped_agents,
 )
 from stad_lab.config import VARIANTS, Config
+from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import to_frame
 from stad_lab.io.weights import WorldModel, load_controller, load_vae, save_controller
 from stad_lab.models.controller import initial_parameters, parameter_count

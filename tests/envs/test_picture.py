@@ -4,11 +4,11 @@ import threading
 
 import numpy as np
 import pytest
-
 from stad_lab.car_racing import HULL_COLUMN, HULL_ROW, make_env, place_car
-from stad_lab.envs import picture
 from stad_lab.frames import to_frame
 from stad_lab.rollouts import RandomDriver
+
+from stad_lab.envs import picture
 
 BAR_TOP = picture.BAR_TOP
 CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))

@@ -16,7 +16,7 @@ import pytest
 from stad_lab.cli import main
 from stad_lab.config import TRACK_RANGES, Config
 from stad_lab.envs.cars import Cars
-from stad_lab.envs.frames import difference_image, episode_differences, to_frame
+from stad_lab.envs.frames import difference_image, episode_differences
 from stad_lab.io.files import checksum, load_json, locked, save_json
 from stad_lab.training.dataset import (
     MANIFEST,
