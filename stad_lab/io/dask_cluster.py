@@ -70,7 +70,9 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
         try:
             check_versions(client.run(versions))
         except ImportError as error:
-            raise ValueError(f"a worker of {address} lacks a package ({error}): {REMEDY}") from error
+            raise ValueError(
+                f"a worker of {address} lacks a package ({error}): {REMEDY}"
+            ) from error
         # Dask's memory manager drops copies that no waiting task needs: V and M, between two calls.
         managed = client.amm.running()
         client.amm.stop()

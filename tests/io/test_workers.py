@@ -163,7 +163,7 @@ def test_a_script_without_a_main_guard_ends_with_one_line_that_says_what_to_do(c
     process = run_script(tmp_path, f"from stad_lab import Config\n{call}\n")
     lines = process.stderr.splitlines()
     assert process.returncode == 1
-    assert 'script.py would run again in every worker process: put what it does below' in lines[-1]
+    assert "script.py would run again in every worker process: put what it does below" in lines[-1]
     assert 'if __name__ == "__main__":' in lines[-1]
     assert process.stderr.count("Traceback") == 1 and "BrokenProcessPool" not in process.stderr
     assert not (tmp_path / "run").exists()

@@ -239,7 +239,11 @@ def test_a_generation_of_several_tracks_mixes_the_hardest_earlier_ones_with_new_
     log = [{"tracks": [10, 11, 12, 13], "returns": [[4.0, 1.0, 3.0, 2.0], [4.0, 1.0, 3.0, 2.0]]}]
     log += [{"tracks": [number], "returns": [[0.0]]} for number in range(4)]
     new = generation_tracks(config(tracks=4), log)
-    for share, expected in ((0.25, [11, *new[:3]]), (0.5, [11, 13, *new[:2]]), (1.0, [11, 13, 12, 10])):
+    for share, expected in (
+        (0.25, [11, *new[:3]]),
+        (0.5, [11, 13, *new[:2]]),
+        (1.0, [11, 13, 12, 10]),
+    ):
         assert generation_tracks(config(replay_share=share, tracks=4), log) == expected
     few = [log[0] | {"tracks": [10], "returns": [[4.0]]}, *log[1:]]
     assert generation_tracks(config(replay_share=0.5, tracks=4), few) == [10, *new[:3]]

@@ -83,7 +83,9 @@ def test_a_folder_with_another_v_and_m_is_refused(quick_run, tmp_path):
     for part in ("vae", "mdn_rnn"):
         shutil.copy(PRETRAINED / "input_output" / f"{part}.safetensors", tmp_path)
     config, before = brief_config(quick_run), sorted(tmp_path.iterdir())
-    with pytest.raises(ValueError, match="was made with another vae .*: give V, M and C of one run"):
+    with pytest.raises(
+        ValueError, match="was made with another vae .*: give V, M and C of one run"
+    ):
         begin(config, quick_run, tmp_path)
     assert sorted(tmp_path.iterdir()) == before
 
@@ -112,9 +114,7 @@ def test_an_interrupted_copy_of_v_is_made_again(tuned, quick_run, tmp_path, monk
     assert (tmp_path / "run" / LOG).read_bytes() == (tuned / LOG).read_bytes()
 
 
-def test_a_fine_tuned_run_can_be_verified_shipped_and_verified_again(
-    tuned, tmp_path, monkeypatch
-):
+def test_a_fine_tuned_run_can_be_verified_shipped_and_verified_again(tuned, tmp_path, monkeypatch):
     monkeypatch.setattr(pipeline, "PRETRAINED", tmp_path)
     shipped = ship(tuned, "tuned")
     assert shipped == tmp_path / "tuned"

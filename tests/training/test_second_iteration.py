@@ -75,7 +75,11 @@ def test_the_dataset_has_the_episodes_of_both_drivers_in_mixed_order(dataset, ag
     assert sorted(order) == list(range(11)) and len(dataset.frames) == 11 and order[-1] != 10
     for entry, number in enumerate(order):
         random = number < first
-        driven = drive_randomly(CONFIG, number) if random else drive_noisily(agent, CONFIG, number - first)
+        driven = (
+            drive_randomly(CONFIG, number)
+            if random
+            else drive_noisily(agent, CONFIG, number - first)
+        )
         assert np.array_equal(dataset.frames[entry], driven[0])
         assert np.array_equal(dataset.actions[entry], driven[1])
         assert dataset.manifest["episodes"][entry]["track"] == driven[2]
@@ -91,7 +95,9 @@ def test_an_interrupted_collection_of_both_drivers_continues(second, quick_run, 
     assert load_json(folder / "manifest.json") == manifest
 
 
-def test_the_dataset_of_one_iteration_is_not_taken_for_that_of_the_other(second, quick_run, tmp_path):
+def test_the_dataset_of_one_iteration_is_not_taken_for_that_of_the_other(
+    second, quick_run, tmp_path
+):
     first = shutil.copytree(quick_run / "dataset", tmp_path / "dataset")
     with ThreadPoolExecutor(1) as executor:
         with pytest.raises(ValueError, match="data.agent_episodes=0, now data.agent_episodes=3"):
@@ -124,10 +130,22 @@ def unfinished(folder):
 @pytest.mark.parametrize(
     ("change", "config", "error"),
     [
-        (None, CONFIG.replace(data={"crop_bar": False}), "data.crop_bar=False, but the run in .* ha"),
-        (None, CONFIG.replace(variant="frame"), "variant='frame', but the run in .* 'input_output'"),
+        (
+            None,
+            CONFIG.replace(data={"crop_bar": False}),
+            "data.crop_bar=False, but the run in .* ha",
+        ),
+        (
+            None,
+            CONFIG.replace(variant="frame"),
+            "variant='frame', but the run in .* 'input_output'",
+        ),
         (of_another_m, CONFIG, "was made with another mdn_rnn than the one beside it"),
-        (unfinished, CONFIG, "is not finished, with 2 of 4 generations: run its own command to the"),
+        (
+            unfinished,
+            CONFIG,
+            "is not finished, with 2 of 4 generations: run its own command to the",
+        ),
     ],
 )
 def test_an_earlier_run_that_does_not_fit_is_refused_before_any_work(
