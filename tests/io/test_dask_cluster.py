@@ -226,5 +226,5 @@ def lack_a_package():
 
 def test_a_worker_with_other_versions_is_named():
     found = {"tcp://near": versions(), "tcp://far": versions() | {"torch": "1.0"}}
-    with pytest.raises(ValueError, match="worker tcp://far has torch 1.0, here it is .*install"):
+    with pytest.raises(ValueError, match=r"worker tcp://far has torch 1.0, here it is .*install"):
         check_versions(found)

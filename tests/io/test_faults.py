@@ -263,7 +263,7 @@ def test_the_record_of_a_baseline_driver_is_no_run_to_continue_or_verify(tmp_pat
     record = {"kind": "record", "variant": "random_driver", "made_with": {}, "budget": {}}
     save_json(tmp_path / "record.json", record)
     for again in (train_again, verify, pipeline.read_finished):
-        with pytest.raises(ValueError, match="record.json is of 'random_driver', no run: choose"):
+        with pytest.raises(ValueError, match=r"record.json is of 'random_driver', no run: choose"):
             again(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["record.json"]
 

@@ -1,4 +1,4 @@
-"""Worker processes: lost, stuck, interrupted, cancelled, suspended, or started by a wrong script."""
+"""Worker processes: lost, interrupted, cancelled, suspended, or started by a wrong script."""
 
 import os
 import shutil
