@@ -148,7 +148,7 @@ def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) 
 
 def check_stages(config: Config, folder: Path, data: Path) -> None:
     """Raise ValueError, before any work, if a finished stage in the folder is of another run."""
-    refuse_first_edition(folder)
+    check_record(folder)
     if not config.data.agent_episodes:
         read_manifest(data, made_with(config))
     if (folder / VAE_FILE).exists():
@@ -160,14 +160,17 @@ def check_stages(config: Config, folder: Path, data: Path) -> None:
             read_log(config, folder, load_world_model(folder))
 
 
-def refuse_first_edition(folder: Path) -> None:
-    """Raise ValueError if a folder holds a run of stad_lab 0.1."""
+def check_record(folder: Path) -> None:
+    """Raise ValueError if a folder holds a run of stad_lab 0.1, or a record of no run."""
     path = folder / RECORD
-    if path.exists() and "settings" in load_json(path):
+    record = load_json(path) if path.exists() else {"config": {}}
+    if "settings" in record:
         raise ValueError(
             f"{folder} holds a run of stad_lab 0.1: continue it with that version, or choose"
             " another folder"
         )
+    if "config" not in record:
+        raise ValueError(f"{path} is of {record.get('variant')!r}, no run: choose another folder")
 
 
 def run_stages(
@@ -263,7 +266,7 @@ def read_finished(earlier: Path) -> dict:
         ValueError: it has not, or a file is damaged.
         FileNotFoundError: there is no run, or no log.
     """
-    refuse_first_edition(earlier)
+    check_record(earlier)
     record = load_json(earlier / RECORD, GIVE_A_RUN)
     log = load_json(earlier / LOG, GIVE_A_RUN)
     done, asked = len(log["generations"]), log["evolution"]["generations"]

@@ -160,7 +160,8 @@ import numpy as np
 from pathlib import Path
 from stad_lab.training.dataset import Dataset
 
-peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+unit = 1e6 if sys.platform == "darwin" else 1e3
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 before = peak()
 dataset = Dataset(Path(sys.argv[1]))
 for indices in np.array_split(np.arange(len(dataset)), 100):

@@ -84,7 +84,7 @@ def test_a_folder_with_another_v_and_m_is_refused(quick_run, tmp_path):
         shutil.copy(PRETRAINED / "input_output" / f"{part}.safetensors", tmp_path)
     config, before = brief_config(quick_run), sorted(tmp_path.iterdir())
     with pytest.raises(
-        ValueError, match="was made with another vae .*: give V, M and C of one run"
+        ValueError, match=r"was made with another vae .*: give V, M and C of one run"
     ):
         begin(config, quick_run, tmp_path)
     assert sorted(tmp_path.iterdir()) == before

@@ -1,4 +1,4 @@
-"""Training in a real kernel: the stop button ends a cell, and the same cell continues, bit for bit."""
+"""Training in a real kernel: a cell that was stopped continues, bit for bit."""
 
 import os
 import re

@@ -99,9 +99,9 @@ def test_the_dataset_of_one_iteration_is_not_taken_for_that_of_the_other(
 ):
     first = shutil.copytree(quick_run / "dataset", tmp_path / "dataset")
     with ThreadPoolExecutor(1) as executor:
-        with pytest.raises(ValueError, match="data.agent_episodes=0, now data.agent_episodes=3"):
+        with pytest.raises(ValueError, match=r"data.agent_episodes=0, now data.agent_episodes=3"):
             collect_again(CONFIG, quick_run, first, executor)
-        with pytest.raises(ValueError, match="data.agent_episodes=3, now data.agent_episodes=0"):
+        with pytest.raises(ValueError, match=r"data.agent_episodes=3, now data.agent_episodes=0"):
             collect(QUICK, second / "dataset", executor)
 
 
@@ -177,7 +177,7 @@ def test_a_second_iteration_continues_only_with_the_agent_that_it_began_with(
     parameters, metadata = load_controller(other / C)
     del metadata["kind"]
     save_controller(other / C, parameters + 1, **metadata)
-    with pytest.raises(ValueError, match="was made with agent.controller="):
+    with pytest.raises(ValueError, match=r"was made with agent.controller="):
         train(CONFIG, second, earlier=other)
 
 
