@@ -34,22 +34,16 @@ def describe_tail(returns: np.ndarray) -> dict:
 def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     """95% interval of the mean of returns (seeds, tracks), resampling seeds and tracks.
 
-    All seeds drive the same tracks, so a track is drawn for all of them together. With fewer than
-    five seeds the interval is too narrow; with one it holds the variance between tracks alone.
+    A track is drawn for all seeds together. With fewer than five seeds the interval is too narrow;
+    with one it holds the variance between tracks alone.
     """
     return middle_95(resampled_means(returns, *draw_tracks(returns, resamples)))
 
 
-def bootstrap_difference(
-    before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES
-) -> list[float]:
-    """95% interval of mean(after) - mean(before), both (seeds, tracks) on the same tracks.
-
-    Seeds are drawn independently for the two, tracks once for both.
-    """
-    rng, tracks = draw_tracks(before, resamples)
-    differences = resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks)
-    return middle_95(differences)
+def bootstrap_difference(before: np.ndarray, after: np.ndarray) -> list[float]:
+    """95% interval of mean(after) - mean(before): seeds drawn for each, tracks once for both."""
+    rng, tracks = draw_tracks(before, RESAMPLES)
+    return middle_95(resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks))
 
 
 def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generator, np.ndarray]:
@@ -79,27 +73,10 @@ def welch_p(one: Sequence[float], other: Sequence[float]) -> float:
 def pooled_interval(groups: Sequence[Sequence[float]], before: int, after: int) -> list[float]:
     """95% interval of mean(groups[after]) - mean(groups[before]), by Student's t.
 
-    The variance is pooled over all `groups` (of run means), so that a comparison of two runs with
-    two borrows degrees of freedom from the other variants of the recipe.
+    The variance within groups is pooled over all of them: two runs alone estimate it poorly.
     """
     free = sum(len(group) - 1 for group in groups)
     variance = sum(np.var(group) * len(group) for group in groups) / free
     error = np.sqrt(variance * (1 / len(groups[before]) + 1 / len(groups[after])))
-    half = stats.t.ppf(0.975, free) * error
     difference = np.mean(groups[after]) - np.mean(groups[before])
-    return [float(difference - half), float(difference + half)]
-
-
-def lost_points(returns: np.ndarray, frames: np.ndarray) -> dict:
-    """Where the points up to 1,000 were lost, means over episodes; the parts sum to 1000 - mean.
-
-    "speed": 0.1 points per frame of a complete lap; "waiting": 0.1 for each further frame, which
-    a missed tile costs; "tiles": those not visited, and 100 points for leaving the field.
-    """
-    laps = frames[returns >= SOLVED]  # at most 1,000 frames, so at least 900 points
-    speed = laps.mean() if len(laps) else frames.mean()
-    return {
-        "speed": float(0.1 * speed),
-        "waiting": float(0.1 * (frames.mean() - speed)),
-        "tiles": float((1000 - returns - 0.1 * frames).mean()),
-    }
+    return [float(difference + t * error) for t in stats.t.ppf([0.025, 0.975], free)]

@@ -12,8 +12,10 @@ import pandas
 
 from stad_lab.config import VARIANTS
 from stad_lab.evaluation import statistics
+from stad_lab.io.files import load_json, write_bytes
 from stad_lab.replication import measurements, tables
 from stad_lab.replication.experiments import BASELINE_DRIVERS, CHANGES, EXPERIMENTS, RECIPES
+from stad_lab.training.pipeline import total_budget
 
 CLAIMS = tables.DATA / "claims.json"
 PRETRAINED = Path(__file__).parent.parent / "pretrained"
@@ -34,7 +36,7 @@ def compute_claims() -> dict[str, dict]:
     episodes, runs, generations = tables.episodes(), tables.read("runs"), tables.read("generations")
     probe, returns = tables.read("probe"), tables.returns_of(episodes)
     made = [name for name in (*BASELINE_DRIVERS, *EXPERIMENTS) if name in returns]
-    trained = set(runs.experiment[runs.role == "world_model"])
+    trained = [name for name in made if name in set(runs.query("role == 'world_model'").experiment)]
     recipes = {name: compare_recipe(returns, name) for name in COMPARED}
     yaw_rate = measurements.yaw_rate_of_z(probe)
     return {
@@ -52,9 +54,7 @@ def compute_claims() -> dict[str, dict]:
         "yaw_rate_of_z": yaw_rate,
         "probe": measurements.describe_probe(probe),
         "models": measurements.describe_models(tables.read("model_metrics")),
-        "stage_minutes": {
-            name: measurements.stage_minutes(runs, name) for name in made if name in trained
-        },
+        "stage_minutes": {name: measurements.stage_minutes(runs, name) for name in trained},
         "speed": measurements.describe_speed(tables.read("speed")),
     }
 
@@ -76,7 +76,7 @@ def describe_experiment(name: str, episodes: pandas.DataFrame, runs: pandas.Data
         "best_90": float(np.sort(returns, axis=1)[:, -BEST:].mean()),
         "runs": returns.mean(axis=1).tolist(),
         **{unit: float(run[f"total.{unit}"].mean()) for unit in tables.UNITS},
-        "lost": statistics.lost_points(own["return"].to_numpy(), own["frames"].to_numpy()),
+        "lost": measurements.lost_points(own["return"].to_numpy(), own["frames"].to_numpy()),
     }
 
 
@@ -138,7 +138,9 @@ def describe_agents(folder: Path = PRETRAINED) -> dict:
     """The shipped agents on the tracks 0 to 99, with Gymnasium's renderer."""
     found = {}
     for path in sorted(folder.glob("*/evaluation.json")):
-        record, evaluation = tables.load(path.with_name("record.json")), tables.load(path)
+        record, evaluation = (
+            load_json(path.with_name(name)) for name in ("record.json", path.name)
+        )
         returns = np.array([episode["return"] for episode in evaluation["episodes"]])
         found[path.parent.name] = {
             **statistics.summarise(returns),
@@ -146,7 +148,7 @@ def describe_agents(folder: Path = PRETRAINED) -> dict:
             "without_worst_5": float(np.sort(returns)[5:].mean()),
             "without_best_5": float(np.sort(returns)[:-5].mean()),
             "gymnasium": record["made_with"]["gymnasium"],
-            **tables.total_budget(record),
+            **total_budget(record),
         }
     return found
 
@@ -172,17 +174,15 @@ def compare_fine_tuning(returns: dict[str, np.ndarray], variant: str) -> dict:
     """What fine-tuning gained, run by run on the same tracks."""
     before, after = (returns[f"{recipe}_{variant}"] for recipe in ("two_iterations", "fine_tuned"))
     failed = [(scores < statistics.FAILED).sum(axis=1).tolist() for scores in (before, after)]
-    gain = {
-        "gain": float((after - before).mean()),
-        "interval": statistics.bootstrap(after - before),
-    }
-    return gain | dict(zip(("failed_before", "failed_after"), failed, strict=True))
+    interval = statistics.bootstrap(after - before)
+    found = {"gain": float((after - before).mean()), "interval": interval}
+    return found | dict(zip(("failed_before", "failed_after"), failed, strict=True))
 
 
 def describe_paper_runs(
     returns: dict, runs: pandas.DataFrame, generations: pandas.DataFrame
 ) -> dict:
-    """Each run of the paper's recipe; `vae` tells which V it had."""
+    """Each run of the paper's recipe; `vae` names the V that it had."""
     found = {}
     for run in runs[runs.experiment.str.startswith("paper_") & (runs.role == "run")].itertuples():
         scores = returns[run.experiment][run.seed]
@@ -205,14 +205,13 @@ def learning_curve(
     """
     named = f"experiment == {experiment!r} and role == 'run' and seed == {seed}"
     run, log = runs.query(named).iloc[0], generations.query(named)
-    validated, size = log["validation.mean"].notna(), "config.evolution."
-    parts = (run[f"budget.{part}.episodes"] for part in ("evolution", "validation"))
-    driven = (
-        run["total.episodes"]
-        - sum(parts)
-        + log["generation"] * (run[size + "population"] * run[size + "tracks"])
-        + validated.cumsum() * run[size + "validation_tracks"]
+    population, tracks, validations = (
+        run[f"config.evolution.{name}"] for name in ("population", "tracks", "validation_tracks")
     )
+    own = run["budget.evolution.episodes"] + run["budget.validation.episodes"]
+    validated = log["validation.mean"].notna()
+    driven = run["total.episodes"] - own + log["generation"] * population * tracks
+    driven += validated.cumsum() * validations
     return driven[validated].to_numpy(np.int64), log["validation.mean"][validated].to_numpy()
 
 
@@ -235,13 +234,14 @@ def forest(claims: dict) -> list[dict]:
     ]
 
 
-def write_claims(path: Path = CLAIMS) -> None:
-    """Compute all statistics and write them, a line for each name in each section."""
+def write_claims(path: Path = CLAIMS) -> Path:
+    """Compute all statistics and write them, a line for each name; returns the file."""
     sections = []
     for section, entries in compute_claims().items():
         lines = [f"  {json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
         sections.append(f" {json.dumps(section)}: {{\n" + ",\n".join(lines) + "\n }")
-    path.write_text("{\n" + ",\n".join(sections) + "\n}\n", encoding="utf-8")
+    write_bytes(path, ("{\n" + ",\n".join(sections) + "\n}\n").encode())
+    return path
 
 
 def read_claims(path: Path = CLAIMS) -> dict:

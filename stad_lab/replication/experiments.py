@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from stad_lab.config import VARIANTS, Config
+from stad_lab.training.fine_tuning import FINE_TUNING
 
 BASELINE_DRIVERS = {  # they do not see the road, and have no seeds
     "random_driver": "smooth random steering and gas, as in the dataset",
@@ -28,10 +29,6 @@ def evolution(**changes) -> dict:
     return {"evolution": changes}
 
 
-FINE_TUNING = evolution(
-    generations=15, population=32, tracks=8, replay_share=0.5,
-    sigma=0.02, sigma_decay=0.97, validate_every=5, averaged_share=0.5,
-)  # fmt: skip
 SECOND_ITERATION = evolution(generations=40, sigma=0.05, replay_share=0.5)
 SECOND_ITERATION |= {"data": {"agent_episodes": 110}}
 EARLY_RECIPE = {"data": {"crop_bar": True}} | evolution(

@@ -1,14 +1,15 @@
-"""What the pages show beside scores: the probe, the quality of V and M, times and speeds.
+"""What the pages show beside mean scores: lost points, the probe, quality of V and M, speeds.
 
 Each function turns a table into nested dicts of plain numbers, for `stad_lab.replication.claims`.
 """
 
 from collections import defaultdict
 
+import numpy as np
 import pandas
 
 from stad_lab.config import VARIANTS
-from stad_lab.evaluation.statistics import FAILED
+from stad_lab.evaluation.statistics import FAILED, SOLVED
 from stad_lab.replication.tables import key
 
 REFERENCES = (  # conditions of `speed` with which the others of their measure are compared
@@ -41,7 +42,7 @@ def yaw_rate_of_z(probe: pandas.DataFrame) -> dict:
 
 
 def describe_probe(probe: pandas.DataFrame) -> dict:
-    """ "DRIVER: WORLD_MODEL-SEED" -> features -> quantity -> R2."""
+    """R2 by "DRIVER: WORLD_MODEL-SEED", features and quantity."""
     found = defaultdict(lambda: defaultdict(dict))
     for line in probe.itertuples():
         name = f"{line.driver}: {key(line.world_model, line.seed)}"
@@ -50,7 +51,7 @@ def describe_probe(probe: pandas.DataFrame) -> dict:
 
 
 def describe_models(metrics: pandas.DataFrame) -> dict:
-    """ "MODEL: WORLD_MODEL" -> metric -> its value, or its values by index."""
+    """Values by "MODEL: WORLD_MODEL" and metric, and by index where a metric has several."""
     found = defaultdict(dict)
     for (model, world_model, metric), own in metrics.groupby(["model", "world_model", "metric"]):
         values = dict(zip(own["index"], own["value"].tolist(), strict=True))
@@ -68,7 +69,7 @@ def stage_minutes(runs: pandas.DataFrame, name: str) -> dict:
 
 
 def describe_speed(speed: pandas.DataFrame) -> dict:
-    """ "PART: MEASURE" -> condition -> median over the rounds, and its ratio to the reference."""
+    """Median over the rounds, and ratio to the reference, by "PART: MEASURE" and condition."""
     found = {}
     for (part, measure), own in speed.groupby(["part", "measure"]):
         medians = own.groupby("condition")["value"].median().to_dict()
@@ -77,3 +78,18 @@ def describe_speed(speed: pandas.DataFrame) -> dict:
             medians = {name: {"median": m, "ratio": m / unit} for name, m in medians.items()}
         found[f"{part}: {measure}"] = medians
     return found
+
+
+def lost_points(returns: np.ndarray, frames: np.ndarray) -> dict:
+    """Where the points up to 1,000 were lost, means over episodes; the parts sum to 1000 - mean.
+
+    "speed": 0.1 for each frame of a mean complete lap; "waiting": 0.1 for each further frame, due
+    to a missed tile; "tiles": those not visited, and 100 points for leaving the field.
+    """
+    laps = frames[returns >= SOLVED]  # a lap of 1,000 frames has 900 points
+    speed = laps.mean() if len(laps) else frames.mean()
+    return {
+        "speed": float(0.1 * speed),
+        "waiting": float(0.1 * (frames.mean() - speed)),
+        "tiles": float((1000 - returns - 0.1 * frames).mean()),
+    }

@@ -5,15 +5,16 @@ A run is named by `experiment`, `role` and `seed`. The role is "run" (CMA-ES for
 of the same seed and those after it, up to the next. C of each run is in `data/controllers`.
 """
 
-import hashlib
-import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas
 
+from stad_lab.evaluation.evaluate import load_evaluation
+from stad_lab.io.files import checksum_of_tensors, load_json, load_tensors, write_bytes
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
+from stad_lab.training.pipeline import total_budget
 
 DATA = Path(__file__).parent / "data"
 TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
@@ -33,13 +34,13 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
 
 
 def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
-    """Read a table, exact to the last bit of each number.
+    """Read a table.
 
     Raises:
         ValueError: a column is missing or has gaps, or a line is there twice.
     """
     (keys, values), path = TABLES[name], folder / f"{name}.csv"
-    table = pandas.read_csv(path, float_precision="round_trip", low_memory=False)
+    table = pandas.read_csv(path, low_memory=False)  # exact from pandas 3.1 on
     for column in keys + values:
         if column not in table or table[column].isna().any():
             raise ValueError(f"{path}: column {column!r} is missing or has empty cells")
@@ -52,7 +53,7 @@ def episodes(folder: Path = DATA) -> pandas.DataFrame:
     """The evaluation of each run: `return` and `frames` on every official track.
 
     Raises:
-        ValueError: as `read`, or a run that was not evaluated on just the tracks 0 to 99.
+        ValueError: as `read`, or an evaluation that is not on the tracks 0 to 99.
     """
     table = read("episodes", folder)
     for (experiment, seed), run in table.groupby(["experiment", "seed"]):
@@ -73,11 +74,9 @@ def returns_of(table: pandas.DataFrame, column: str = "return") -> dict[str, np.
 
 
 def fitness(run: str, folder: Path = DATA) -> dict[str, np.ndarray]:
-    """All returns of a CMA-ES run, which is named as by `key`.
+    """All returns of a CMA-ES run (named as by `key`), the seeds of its tracks, and validations.
 
-    Returns:
-        "returns" float64 (generations, agents, tracks), "tracks" int (generations, tracks) and
-        "validation" float64 (validations, tracks).
+    Shapes: (generations, agents, tracks), (generations, tracks) and (validations, tracks).
     """
     with np.load(folder / "fitness.npz") as file:
         return {part: file[f"{run}/{part}"] for part in ("returns", "tracks", "validation")}
@@ -92,33 +91,32 @@ def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str
     """Add the records of a finished run to the tables, in place of those that it has there.
 
     Raises:
-        ValueError: the evaluation is of another variant, renderer, controller or other tracks.
+        ValueError: a damaged file, or an evaluation of another variant, renderer, controller or
+            of other tracks.
     """
     run = dict(zip(RUN, (experiment, role, seed), strict=True))
-    line = run | describe_record(load(folder / "record.json"))
+    line = run | describe_record(load_json(folder / "record.json"))
     if (file := folder / "controller.safetensors").exists():
-        line["controller"] = hashlib.sha256(file.read_bytes()).hexdigest()
+        line["controller"] = checksum_of_tensors(load_tensors(file)[0])
     if (path := folder / "evaluation.json").exists():  # checked before anything is written
-        evaluation = load(path)
+        evaluation = load_evaluation(path)
         check_evaluation(path, evaluation, experiment, line.get("controller"))
         line["seconds.evaluation"] = evaluation["seconds"]
         driven = pandas.DataFrame(evaluation["episodes"])
         replace_lines("episodes", driven.assign(experiment=experiment, seed=seed), to)
     if (path := folder / "evolution.json").exists():
-        log = load(path)
+        log = load_json(path)
         line |= {"vae": log["vae"], "mdn_rnn": log["mdn_rnn"]} | flatten(log["best"], "best.")
         add_log(run, log["generations"], to)
     for network in ("vae", "mdn_rnn"):
         if (path := folder / f"{network}.safetensors").exists() and role != "run":
-            content = path.read_bytes()  # its header: a length of 8 bytes, then JSON
-            header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-            metadata = json.loads(header["__metadata__"]["stad_lab"])
+            metadata = load_tensors(path)[1]
             line[network] = metadata["weights"]
             add_history(run | {"network": network}, metadata["history"], to)
     if file.exists():
-        (to / "controllers").mkdir(exist_ok=True)
-        copy = to / "controllers" / f"{key(experiment, seed, role)}.safetensors"
-        shutil.copyfile(file, copy)
+        copies = to / "controllers"
+        copies.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, copies / f"{key(**run)}.safetensors")
     replace_lines("runs", pandas.DataFrame([line]), to)
 
 
@@ -147,44 +145,18 @@ def describe_record(record: dict) -> dict:
     return {name: value for name, value in line.items() if value is not None}
 
 
-def total_budget(record: dict) -> dict[str, int]:
-    """Agents, episodes and frames of a run and of the runs before it that it continues.
-
-    A second iteration drives the random episodes of the first once more; they count once.
-    """
-    parts = [part for part in record["budget"].values() if isinstance(part, dict)]
-    total = {unit: sum(part[unit] for part in parts) for unit in ("episodes", "frames")}
-    total["agents"] = record["budget"].get("agents", 0)
-    if "earlier" in record:
-        one, other = (
-            (c["seed"], c["data"]) for c in (record["config"], record["earlier"]["config"])
-        )
-        names = ("episodes", "episode_frames", "random_starts", "crop_bar")
-        same = one[0] == other[0] and all(one[1][name] == other[1][name] for name in names)
-        again = record["budget"]["random"] if same else {}
-        before = total_budget(record["earlier"])
-        total = {unit: total[unit] + before[unit] - again.get(unit, 0) for unit in UNITS}
-    return total
-
-
-def add_log(run: dict, generations: list[dict], to: Path) -> None:
-    """Add the log of a CMA-ES run to `generations` and to the compact file of all returns."""
-    lines = pandas.DataFrame([run | flatten(entry) for entry in generations])
-    means = [np.mean(entry["returns"], axis=1) for entry in generations]
+def add_log(run: dict, log: list[dict], to: Path) -> None:
+    """Add the generations of a CMA-ES run to `generations` and to the file of all returns."""
+    lines = pandas.DataFrame([run | flatten(entry) for entry in log])
+    fitness = [np.mean(returns, axis=1) for returns in lines["returns"]]
     for name, statistic in (("worst", np.min), ("mean", np.mean), ("best", np.max)):
-        lines[name] = [statistic(fitness) for fitness in means]
-    validated = [entry["validation"]["returns"] for entry in generations if "validation" in entry]
-    returns = {
-        "returns": [entry["returns"] for entry in generations],
-        "tracks": [entry["tracks"] for entry in generations],
-        "validation": validated,
-    }
-    replace_lines(
-        "generations", lines.drop(columns=["validation.returns", "returns", "tracks"]), to
-    )
+        lines[name] = [statistic(values) for values in fitness]
+    arrays = ["returns", "tracks", "validation.returns"]
+    replace_lines("generations", lines.drop(columns=arrays), to)
     path = to / "fitness.npz"
     kept = dict(np.load(path)) if path.exists() else {}
-    kept |= {f"{key(**run)}/{part}": np.array(values) for part, values in returns.items()}
+    for name in arrays:
+        kept[f"{key(**run)}/{name.split('.')[0]}"] = np.array(lines[name].dropna().tolist())
     np.savez_compressed(path, **{name: kept[name] for name in sorted(kept)})
 
 
@@ -212,8 +184,8 @@ def save(name: str, table: pandas.DataFrame, folder: Path = DATA) -> None:
     for column in table.select_dtypes("float"):  # gaps make floats of whole numbers
         if (table[column].dropna() % 1 == 0).all():
             table[column] = table[column].astype("Int64")
-    folder.mkdir(parents=True, exist_ok=True)
-    table.to_csv(folder / f"{name}.csv", index=False, lineterminator="\n")
+    text = table.to_csv(index=False, lineterminator="\n")
+    write_bytes(folder / f"{name}.csv", text.encode())
 
 
 def flatten(values: dict, prefix: str = "") -> dict:
@@ -223,8 +195,3 @@ def flatten(values: dict, prefix: str = "") -> dict:
         nested = isinstance(value, dict)
         found |= flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
     return found
-
-
-def load(path: Path) -> dict:
-    """Read a JSON file."""
-    return json.loads(path.read_text(encoding="utf-8"))
