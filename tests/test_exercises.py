@@ -437,7 +437,7 @@ WRONG = [
         "02",
         "reparameterise-values",
         "reparameterise = lambda mu, v, noise: mu + (v / 2).exp() * torch.randn_like(mu)",
-        "drawn by you",
+        "sampled by you",
     ),
     (
         "02",
@@ -451,7 +451,7 @@ WRONG = [
         "active = lambda kl: np.flatnonzero(kl.mean(0) > 0.05)",
         "order of the numbers",
     ),
-    ("02", "active-check", "active = lambda kl: kl.mean(0) > 0.05", "numbers of those"),
+    ("02", "active-check", "active = lambda kl: kl.mean(0) > 0.05", "return their numbers"),
     (
         "02",
         "active-check",
@@ -468,7 +468,7 @@ WRONG = [
         "02",
         "active-check",
         "active = lambda kl: torch.tensor([3, 0, 1])",
-        "expected an array, which .numpy",
+        "expected an array: use .numpy",
     ),
     (
         "02",
@@ -492,7 +492,7 @@ WRONG = [
         "02",
         "reaction-check",
         "def reaction(vae, film, k):\n"
-        "    frame, difference = to_pictures(film, earlier_frames(film, k))\n"
+        "    frame, difference = to_tensors(film, earlier_frames(film, k))\n"
         "    mu, turned = vae.encode(frame, difference)[0], vae.encode(frame, -difference)[0]\n"
         "    return float((mu - turned)[50:].norm() / (mu[50:] - mu[:-50]).norm())",
         "one norm over all frames",
@@ -501,7 +501,7 @@ WRONG = [
         "02",
         "reaction-check",
         "solved = reaction\ndef reaction(*given): return torch.tensor(solved(*given))",
-        "expected a number, which float",
+        "expected a number: use float",
     ),
     (
         "02",
@@ -519,7 +519,7 @@ WRONG = [
         "02",
         "mean-interval-check",
         "mean_interval = lambda values, rng: np.percentile(values, [2.5, 97.5])",
-        "where a drive lies",
+        "where an episode lies",
     ),
     (
         "02",
@@ -557,7 +557,7 @@ WRONG = [
         "03",
         "log-density-values",
         "solved = log_density\nlog_density = lambda logpi, mean, s, target: solved(logpi, mean, s / 2, target)",
-        "not ln sigma squared as in 02",
+        "not ln sigma squared",
     ),
     (
         "03",
@@ -622,13 +622,13 @@ WRONG = [
         "03",
         "horizon-check",
         "horizon = lambda dream, constant: int((dream > constant).any(0).argmax()) + 1",
-        "take the sums over the drives",
+        "take the sums over the episodes",
     ),
     (
         "03",
         "horizon-check",
         "horizon = lambda dream, constant: int(((dream > constant).mean(0) > 0.5).argmax()) + 1",
-        "at this step most drives err more",
+        "at this step most episodes err more",
     ),
     (
         "03",
@@ -654,7 +654,7 @@ WRONG = [
         "horizon-interval-check",
         "horizon_interval = lambda dream, constant, rng: "
         "np.percentile([horizon(dream[[i]], constant[[i]]) for i in range(15)], [2.5, 97.5])",
-        "single drives; draw 15",
+        "single episodes; draw 15",
     ),
     (
         "03",
@@ -662,7 +662,7 @@ WRONG = [
         "def horizon_interval(dream, constant, rng):\n"
         "    drawn = [np.take_along_axis(dream, rng.integers(15, size=(15, 60)), 0) for _ in range(2000)]\n"
         "    return np.percentile([horizon(d, constant) for d in drawn], [2.5, 97.5])",
-        "steps of one drive belong together",
+        "steps of one episode belong together",
     ),
     (
         "03",
@@ -686,7 +686,7 @@ WRONG = [
         "def horizon_interval(dream, constant, rng):\n"
         "    drawn = rng.integers(15, size=(2000, 2, 15))\n"
         "    return np.percentile([horizon(dream[one], constant[other]) for one, other in drawn], [2.5, 97.5])",
-        "draw the drives once, for both",
+        "draw the episodes once, for both",
     ),
     (
         "04",
