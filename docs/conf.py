@@ -1,8 +1,8 @@
-"""The site of the notebooks as they ran, and of the library: sphinx-build -W -c docs . docs/_build/site
+"""Sphinx configuration of the site: `sphinx-build -W -c docs . docs/_build/site`.
 
-The source folder is the whole repository, so that the notebooks are read where they lie, and their links hold here as
-on a code host. Their outputs are cached: only a change of a notebook, of stad_lab or of the settings runs them again.
-Nothing needs a network, neither the build nor the finished pages.
+The source folder is the repository, so the notebooks are read in place and their links hold here as
+on a code host. Their outputs are cached: only a changed notebook, library or preset runs them
+again. Neither the build nor the pages need a network.
 """
 
 import hashlib
@@ -13,16 +13,16 @@ from pathlib import Path
 from docutils import nodes
 from sphinx.util import logging
 
-from stad_lab import Settings
+from stad_lab.config import PRESET_VARIABLE
 
 HERE = Path(__file__).parent
 PACKAGE = HERE.parent / "stad_lab"
 sys.path.insert(0, str(HERE))
-from site_check import faults
+from site_check import faults  # noqa: E402
 
 
 def digest(folder: Path) -> str:
-    """A short name for the present state of all files of a folder; the cache of outputs is valid for one state."""
+    """A short hash of all files of a folder, which names the cache of outputs."""
     files = sorted(
         file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts
     )
@@ -36,28 +36,29 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
-    "sphinx-mathjax-offline",  # formulas without a network: it serves MathJax from the site itself
+    "sphinx-mathjax-offline",  # MathJax is part of the site
 ]
 root_doc = "docs/index"
-include_patterns = ["README.md", "docs/**", "notebooks/*.ipynb", "notebooks/exercises/*.*"]
+include_patterns = [
+    "README.md",
+    "docs/**",
+    "notebooks/*.ipynb",
+    "notebooks/exercises/*.*",
+    "stad_lab/pretrained/*/README.md",
+]
 exclude_patterns = ["docs/_*", ".*", "runs", "**/.ipynb_checkpoints", "notebooks/exercises/*.py"]
 templates_path = [str(HERE / "_templates")]
-suppress_warnings = [
-    "myst.header"
-]  # a notebook's markdown cell may begin a step at the second level
+suppress_warnings = ["myst.header"]  # a cell may begin at the second heading level
 
 # Notebooks
-os.environ.setdefault(
-    "OMP_NUM_THREADS", "1"
-)  # on busy cores, threads that wait for each other slow PyTorch manyfold
+PRESET = os.environ.get(PRESET_VARIABLE, "laptop")
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads that wait for each other are slow
 nb_execution_mode = "cache"
-nb_execution_cache_path = str(HERE / "_cache" / f"{Settings.preset().name}-{digest(PACKAGE)}")
-nb_execution_excludepatterns = [
-    "notebooks/exercises/*"
-]  # their answers are missing, and they say so
+nb_execution_cache_path = str(HERE / "_cache" / f"{PRESET}-{digest(PACKAGE)}")
+nb_execution_excludepatterns = ["notebooks/exercises/*"]  # their answers are missing
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True
-nb_ipywidgets_js = {}  # widgets need a kernel, and their scripts a network: see explain_widgets
+nb_ipywidgets_js = {}  # their scripts would need a network: see explain_widgets
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
 
@@ -70,7 +71,7 @@ autodoc_typehints_description_target = "documented"
 autodoc_default_options = {"members": True}
 napoleon_numpy_docstring = False
 
-# Looks
+# Appearance
 html_theme = "furo"
 html_title = "stad_lab"
 html_static_path = [str(HERE / "_static")]
@@ -87,26 +88,26 @@ WIDGET = "application/vnd.jupyter.widget-view+json"
 
 
 def explain_widgets(app, doctree) -> None:
-    """Where a widget stood in the notebook, say so: without a kernel there is nothing to move."""
+    """Replace each widget by a note: without a kernel there is nothing to move."""
     for bundle in list(doctree.findall(nodes.container)):
         if any(
             isinstance(child, nodes.container) and child.get("mime_type") == WIDGET
             for child in bundle.children
         ):
-            text = "Here stands a widget that needs a running kernel: open the notebook in JupyterLab to move it."
+            text = "This widget needs a running kernel: open the notebook in JupyterLab."
             bundle.replace_self(
                 nodes.container("", nodes.paragraph("", text), classes=["without-kernel"])
             )
 
 
 def check_site(app, error) -> None:
-    """Turn every fault of the finished pages into a warning, which `-W` makes an error."""
+    """Report each fault of the built site as a warning, which `-W` makes an error."""
     if error is None and app.builder.name == "html":
         for fault in faults(Path(app.outdir)):
             logging.getLogger("site_check").warning(fault)
 
 
 def setup(app) -> None:
-    """Hook the two in; the site is checked after all its files, MathJax's among them, are there."""
+    """Connect both; the check runs last, after MathJax has been copied."""
     app.connect("doctree-read", explain_widgets)
     app.connect("build-finished", check_site, priority=900)

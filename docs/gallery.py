@@ -1,7 +1,7 @@
-"""Draw the gallery of the README again, some figures of the notebooks: python docs/gallery.py
+"""Render the figures of the front page again, from the notebooks: `python docs/gallery.py`.
 
-A committed notebook has no outputs, so whoever reads on a code host would see no figure of it at all. Each picture
-is named by the cell that shows it, and holds its alternative text.
+A committed notebook has no outputs, so a reader on a code host sees no figures. Each picture is
+named by the cell that shows it, and holds its alternative text.
 """
 
 import base64
@@ -13,11 +13,12 @@ import nbformat
 from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
-CELLS = ("00-11", "01-16", "02-17", "02-34", "03-31", "04-08", "06-15")
+PICTURES = NOTEBOOKS / "pictures"
+CELLS = ("00-11", "01-16", "02-17", "03-31", "04-08", "06-15")
 
 
 def figure_of(cell: str) -> bytes:
-    """The PNG that a cell of a notebook shows, when the notebook has run from its first cell to this one."""
+    """The PNG that a cell of a notebook shows, after the notebook has run up to this cell."""
     (notebook,) = NOTEBOOKS.glob(f"{cell[:2]}_*.ipynb")
     ran = nbformat.read(notebook, as_version=4)
     last = [one["id"] for one in ran.cells].index(cell)
@@ -30,8 +31,8 @@ def figure_of(cell: str) -> bytes:
 
 
 if __name__ == "__main__":
-    os.environ["STAD_LAB_SETTINGS"] = "laptop"  # the kernels inherit it
+    os.environ["STAD_LAB_PRESET"] = "laptop"  # the kernels inherit it
     for cell in CELLS:
-        picture = NOTEBOOKS / "pictures" / f"{cell}.png"
+        picture = PICTURES / f"{cell}.png"
         picture.write_bytes(figure_of(cell))
         print(picture)

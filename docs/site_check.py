@@ -1,4 +1,4 @@
-"""What no page of the site may have: links that lead nowhere, pictures without words, parts from the network."""
+"""Faults of a built site: broken links, images without alternative text, parts from the network."""
 
 from html.parser import HTMLParser
 from pathlib import Path
@@ -15,25 +15,25 @@ ADDRESSES = {
 
 
 class Page(HTMLParser):
-    """What one page refers to, and what can be referred to in it."""
+    """The links and the anchors of one page, and its images without alternative text."""
 
     def __init__(self, text: str):
         super().__init__()
-        self.anchors, self.links, self.speechless = {"", "top"}, set(), []
+        self.anchors, self.links, self.undescribed = {"", "top"}, set(), []
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Note the tag's id, its address, and whether it is a picture without alternative text."""
+        """Collect the tag's id, its address, and an image without alternative text."""
         values = dict(attrs)
         self.anchors.add(values.get("id") or "")
         if values.get(ADDRESSES.get(tag, "")):
             self.links.add((tag, values[ADDRESSES[tag]]))
         if tag == "img" and not (values.get("alt") or "").strip():
-            self.speechless.append(str(values)[:100])
+            self.undescribed.append(str(values)[:100])
 
 
 def faults(site: Path) -> list[str]:
-    """All faults of a built site, one line each. External links of the text are not followed: that needs a network.
+    """All faults of a built site, one line each. External links are not followed.
 
     Args:
         site: folder of the site's HTML files.
@@ -44,7 +44,7 @@ def faults(site: Path) -> list[str]:
     for file, page in pages.items():
         name = file.relative_to(site).as_posix()
         found += [
-            f"{name}: a picture without alternative text: {picture}" for picture in page.speechless
+            f"{name}: an image without alternative text: {picture}" for picture in page.undescribed
         ]
         for tag, address in sorted(page.links):
             link = urlsplit(address)
@@ -54,7 +54,7 @@ def faults(site: Path) -> list[str]:
             if link.scheme or link.netloc:
                 found.append(f"{name}: <{tag}> needs the network: {address[:100]}")
             elif not target.is_file():
-                found.append(f"{name}: <{tag}> leads to a file that is not there: {address}")
+                found.append(f"{name}: <{tag}> leads to a missing file: {address}")
             elif target in pages and unquote(link.fragment) not in pages[target].anchors:
-                found.append(f"{name}: <{tag}> leads to a place that is not there: {address}")
+                found.append(f"{name}: <{tag}> leads to a missing anchor: {address}")
     return found

@@ -276,8 +276,8 @@ def load_agent(source: str | Path) -> Agent:
 
     Args:
         source: "frame", "input", "output" or "input_output" for the shipped agents, which are of
-            one recipe and differ in their variant alone; the name of another shipped agent; or the
-            folder of a run. A folder with such a name is given as a Path.
+            one recipe (but the second iteration of "input" replayed no hard tracks); the name of
+            another shipped agent; or the folder of a run. Give a folder of such a name as a Path.
 
     Raises:
         FileNotFoundError: no such agent, or its run is not finished.

@@ -1,10 +1,12 @@
-"""The environment check: is everything here that the notebooks need, and what to do about what is not.
+"""The doctor: is everything here that the notebooks need, and what to do about what is not.
 
-It must be able to run where things are broken, so nothing but the standard library is imported before it is looked for.
-`python -m stad_lab check` prints it; in a notebook, `check_environment()` at the end of a cell shows it.
+It must run where things are broken, so until a library has been looked at, only the standard
+library is imported. `python -m stad_lab check` prints the report; in a notebook,
+`check_environment()` at the end of a cell shows it.
 """
 
-import importlib
+import contextlib
+import importlib.util
 import os
 import platform
 import shutil
@@ -20,40 +22,23 @@ GREEN, AMBER, RED = "green", "amber", "red"
 COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
 LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
-MODULES = (
-    *(
-        "numpy",
-        "cv2",
-        "torch",
-        "gymnasium",
-        "Box2D",
-        "pygame",
-        "cma",
-        "sklearn",
-        "scipy",
-        "safetensors",
-    ),
-    *("matplotlib", "PIL", "ipywidgets"),
-)
+MODULES = ("numpy", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma", "safetensors", "psutil")
+OPTIONAL_MODULES = ("matplotlib", "PIL", "ipywidgets", "distributed")  # of the extras
 
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the check."""
+    """One line of the report; its state is "green", "amber" (a drawback) or "red" (a failure)."""
 
     state: str
-    """"green" (as it should be), "amber" (works, with a drawback) or "red" (some notebook will fail)."""
     name: str
-    """What was looked at."""
     found: str
-    """What was found."""
     remedy: str = ""
-    """What to do; empty for green."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """All lines of the check; prints as text in a terminal, and as a table in a notebook."""
+    """All lines; prints as text in a terminal, and as a table in a notebook."""
 
     lines: tuple[Line, ...]
 
@@ -65,74 +50,47 @@ class Report:
     @property
     def summary(self) -> str:
         """One sentence on the whole."""
-        counts = [(sum(line.state == state for line in self.lines), state) for state in COLORS]
-        counted = ", ".join(f"{count} {state}" for count, state in counts if count)
-        verdict = (
-            "everything needed is here"
-            if self.ok
-            else "follow the remedies of the red lines, then run this again"
-        )
-        return f"{counted}: {verdict}"
+        states = [line.state for line in self.lines]
+        counted = ", ".join(f"{states.count(one)} {one}" for one in COLORS if one in states)
+        advice = "follow the remedies of the red lines, then run this again"
+        return f"{counted}: {'everything needed is here' if self.ok else advice}"
 
     def __str__(self) -> str:
         width = max(len(line.name) for line in self.lines)
-        texts = []
-        for line in self.lines:
-            texts.append(f"{line.state:6s} {line.name:{width}s}  {line.found}")
-            if line.remedy:
-                texts.append(f"{'':6s} {'':{width}s}  remedy: {line.remedy}")
+        texts = [
+            f"{line.state:6s} {line.name:{width}s}  {line.found}"
+            + (f"\n{'':{width + 7}s}  remedy: {line.remedy}" if line.remedy else "")
+            for line in self.lines
+        ]
         return "\n".join([*texts, self.summary])
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        """The summary, and a table that stands open if a line is not green. No colour of its own for text or ground."""
-        rows = []
+        """The summary and a table, open unless all is green; text and background as the page's."""
+        rows = ""
         for line in self.lines:
             remedy = f"<br><b>{escape(line.remedy)}</b>" if line.remedy else ""
             mark = f'<span style="color: {COLORS[line.state]}">&#9679;</span> {line.state}'
             cells = (mark, escape(line.name), escape(line.found) + remedy)
-            rows.append(
-                "<tr>"
-                + "".join(f'<td style="text-align: left">{cell}</td>' for cell in cells)
-                + "</tr>"
-            )
+            rows += "".join(["<tr>", *(f'<td align="left">{cell}</td>' for cell in cells), "</tr>"])
         opened = "" if all(line.state == GREEN for line in self.lines) else " open"
-        return f"<details{opened}><summary>{escape(self.summary)}</summary><table>{''.join(rows)}</table></details>"
+        summary = f"<summary>{escape(self.summary)}</summary>"
+        return f"<details{opened}>{summary}<table>{rows}</table></details>"
 
 
 def check_environment(folder: str | Path = ".") -> Report:
-    """Look at the versions, Box2D and the pictures, the weights, the machine, the folder and the widgets.
-
-    Nothing that is missing or broken stops it: what a check raises becomes its red line. Most of its time goes into
-    importing what the notebooks will import anyway.
-
-    Args:
-        folder: where you work: looked at for space and for the right to write.
-    """
-    checks = (
-        check_python,
-        check_packages,
-        check_imports,
-        check_settings,
-        check_weights,
-        check_drive,
-    )
+    """Look at everything, `folder` being where you work; a check that raises gives a red line."""
+    checks = (check_python, check_packages, check_imports, check_preset, check_weights, check_drive)
     checks += (check_processors, check_memory, check_gpu, check_widgets)
     lines = [line for check in checks for line in attempt(check)]
     return Report((*lines, *attempt(check_folder, Path(folder))))
 
 
 def tell_environment() -> int:
-    """Print what `check_environment` finds; returns what the command ends with, 0 if all is well."""
+    """Print what `check_environment` finds; returns the exit status, 0 if nothing is red."""
     print(report := check_environment())
     return 0 if report.ok else 1
-
-
-def escape_foreign_letters() -> None:
-    """From now on print letters that the console does not have, of a folder's name for example, as escapes."""
-    if hasattr(sys.stdout, "reconfigure"):
-        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def attempt(check: Callable[..., Iterator[Line]], *arguments) -> list[Line]:
@@ -147,43 +105,49 @@ def attempt(check: Callable[..., Iterator[Line]], *arguments) -> list[Line]:
 
 
 def check_python() -> Iterator[Line]:
-    """Python's own version, against what stad_lab asks for."""
+    """Python's own version, against the one that stad_lab needs."""
     try:
         wanted = metadata("stad_lab")["Requires-Python"]
     except PackageNotFoundError:
         yield Line(RED, "stad_lab", f"not installed for {sys.executable}", INSTALL)
         return
     yield Line(GREEN, "stad_lab", version("stad_lab"))
-    found = platform.python_version().rstrip(
-        "+"
-    )  # of a build from a branch, 3.12.3+: as good as 3.12.3
+    found = platform.python_version().rstrip("+")  # a build from a branch: as good as the release
     yield compare("Python", found, wanted, f"make a new environment with a Python {wanted}")
 
 
 def check_packages() -> Iterator[Line]:
-    """The installed version of every requirement."""
+    """The versions of all required packages, and what the extras lack."""
     from packaging.requirements import Requirement
 
+    extras = {extra: [] for extra in metadata("stad_lab").get_all("Provides-Extra") or ()}
     for requirement in map(Requirement, requires("stad_lab")):
-        if requirement.marker and not requirement.marker.evaluate({"extra": ""}):
-            continue
-        try:
-            found = version(requirement.name)
-        except PackageNotFoundError:
-            yield Line(RED, requirement.name, f"missing for {sys.executable}", INSTALL)
-        else:
-            yield compare(requirement.name, found, str(requirement.specifier), INSTALL)
-    try:
-        found = version("box2d-py")
-    except PackageNotFoundError:
-        return
-    remedy = "pip uninstall box2d-py box2d, then " + INSTALL
-    yield Line(
-        RED,
-        "box2d-py",
-        f"{found}, which is installed over the same module `Box2D` as box2d",
-        remedy,
-    )
+        marker, name = requirement.marker, requirement.name
+        found = installed_version(name)
+        if not marker or marker.evaluate({"extra": ""}):
+            if found is None:
+                yield Line(RED, name, f"missing for {sys.executable}", INSTALL)
+            else:
+                yield compare(name, found, str(requirement.specifier), INSTALL)
+        elif found is None or not requirement.specifier.contains(found, prereleases=True):
+            for extra in extras:
+                if marker.evaluate({"extra": extra}):
+                    extras[extra].append(f"{name} ({found or 'missing'})")
+    for extra, lacking in extras.items():
+        remedy = f"only if you need this extra: pip install 'stad_lab[{extra}]'"
+        state = Line(AMBER, f"extra {extra}", f"incomplete: {', '.join(lacking)}", remedy)
+        yield state if lacking else Line(GREEN, f"extra {extra}", "complete")
+    if found := installed_version("box2d-py"):
+        remedy = f"pip uninstall box2d-py box2d, then {INSTALL}"
+        yield Line(
+            RED, "box2d-py", f"{found}, which overwrites the module `Box2D` of box2d", remedy
+        )
+
+
+def installed_version(name: str) -> str | None:
+    """The version of an installed package, or None."""
+    with contextlib.suppress(PackageNotFoundError):
+        return version(name)
 
 
 def compare(name: str, found: str, wanted: str, remedy: str) -> Line:
@@ -192,151 +156,116 @@ def compare(name: str, found: str, wanted: str, remedy: str) -> Line:
 
     if SpecifierSet(wanted).contains(found, prereleases=True):
         return Line(GREEN, name, found)
-    return Line(RED, name, f"{found}, but stad_lab wants {wanted}", remedy)
+    return Line(RED, name, f"{found}, but stad_lab needs {wanted}", remedy)
 
 
 def check_imports() -> Iterator[Line]:
-    """Whether the libraries not only lie there, but load."""
+    """Whether the installed libraries load."""
     broken = 0
-    for module in MODULES:
+    optional = [module for module in OPTIONAL_MODULES if importlib.util.find_spec(module)]
+    for module in (*MODULES, *optional):
         try:
             importlib.import_module(module)
         except Exception as error:  # OSError for a missing system library, for example
             broken += 1
-            yield Line(RED, f"import {module}", f"{type(error).__name__}: {error}", INSTALL)
+            state = AMBER if module in optional else RED
+            yield Line(state, f"import {module}", f"{type(error).__name__}: {error}", INSTALL)
     if not broken:
-        yield Line(GREEN, "imports", f"all {len(MODULES)} libraries load")
+        yield Line(GREEN, "imports", f"all {len(MODULES) + len(optional)} libraries load")
 
 
-def check_settings() -> Iterator[Line]:
-    """The preset that $STAD_LAB_SETTINGS names."""
-    from stad_lab.config import ENVIRONMENT_VARIABLE, PRESETS, Settings
+def check_preset() -> Iterator[Line]:
+    """The preset that the environment variable STAD_LAB_PRESET names."""
+    from stad_lab.config import PRESET_VARIABLE, PRESETS, Config
 
     try:
-        yield Line(GREEN, "settings", Settings.preset().name)
+        Config.preset()
+        yield Line(GREEN, "preset", os.environ.get(PRESET_VARIABLE) or "laptop")
     except ValueError as error:
-        yield Line(
-            RED,
-            "settings",
-            str(error),
-            f"set {ENVIRONMENT_VARIABLE} to one of {', '.join(PRESETS)}, or unset it",
-        )
+        remedy = f"set {PRESET_VARIABLE} to one of {', '.join(PRESETS)}, or unset it"
+        yield Line(RED, "preset", str(error), remedy)
 
 
 def check_weights() -> Iterator[Line]:
     """The trained weights that come with stad_lab."""
     files = sorted(Path(__file__).with_name("pretrained").rglob("*.safetensors"))
-    small = [
-        file.name for file in files if file.stat().st_size < 500
-    ]  # a pointer of Git LFS, or half a download
-    if not files or small:
+    # A pointer of Git LFS, or an incomplete download:
+    small = [f"{file.parent.name}/{file.name}" for file in files if file.stat().st_size < 500]
+    size = sum(file.stat().st_size for file in files) / 1e6
+    if files and not small:
+        yield Line(GREEN, "weights", f"{len(files)} files, {size:.0f} MB")
+    else:
         found = f"truncated: {', '.join(small)}" if small else "none in stad_lab/pretrained"
         yield Line(RED, "weights", found, "download or clone the whole of stad_lab again")
-    else:
-        yield Line(
-            GREEN,
-            "weights",
-            f"{len(files)} files, {sum(file.stat().st_size for file in files) / 1e6:.0f} MB",
-        )
 
 
 def check_drive() -> Iterator[Line]:
-    """A real reset and step of CarRacing-v3 with both renderers, and a look at the pictures."""
+    """A reset and a step of CarRacing-v3 with each renderer, and whether the picture is black."""
     import numpy as np
 
     from stad_lab.envs.car_racing import make_env
 
-    for name, fast in (("CarRacing, fast", True), ("CarRacing, Gymnasium's", False)):
+    remedy = "pip install --force-reinstall pygame-ce opencv-python-headless"
+    for name, fast in (("fast renderer", True), ("Gymnasium's renderer", False)):
         env = make_env(fast=fast)
-        observation, _ = env.reset(seed=1)
+        env.reset(seed=1)
         observation, *_ = env.step(np.array([0.0, 0.5, 0.0], np.float32))
         env.close()
         colors = len(np.unique(observation.reshape(-1, 3), axis=0))
-        found = f"Box2D drives; picture {observation.shape}, {colors} colours, mean {observation.mean():.0f} of 255"
+        found = f"picture {observation.shape}, {colors} colours, mean {observation.mean():.0f}"
         black = observation.mean() < 10 or colors < 5
-        remedy = (
-            "reinstall the renderer: pip install --force-reinstall pygame-ce opencv-python-headless"
-        )
-        yield Line(RED, name, found + ": black", remedy) if black else Line(GREEN, name, found)
+        yield Line(RED, name, f"{found}: black", remedy) if black else Line(GREEN, name, found)
 
 
 def check_processors() -> Iterator[Line]:
-    """Processor cores that this process may use, and whether others keep them busy."""
-    cores = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    """Cores that this process may use, and whether others keep them busy."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     limit = LIMITS / "cpu.max"
     quota, _, period = limit.read_text().partition(" ") if limit.exists() else ("max", "", "")
     allowed = max(1, int(quota) // int(period)) if quota.isdigit() else cores
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    remedy = "close other programs; on a shared machine, set OMP_NUM_THREADS=1 before you start JupyterLab"
-    if (
-        load > 2 * cores and os.environ.get("OMP_NUM_THREADS") != "1"
-    ):  # PyTorch's threads then wait for each other
-        yield Line(
-            AMBER, "cores", f"{cores}, and on average {load:.0f} processes want them", remedy
-        )
-    elif allowed < cores and not os.environ.get(
-        "OMP_NUM_THREADS"
-    ):  # as many threads as cores, and few may run
+    threads = os.environ.get("OMP_NUM_THREADS")
+    if load > 2 * cores and threads != "1":  # PyTorch's threads then wait for each other
+        remedy = "close other programs; on a shared machine start JupyterLab with OMP_NUM_THREADS=1"
+        yield Line(AMBER, "cores", f"{cores}, for {load:.0f} busy processes", remedy)
+    elif allowed < cores and not threads:  # PyTorch would start as many threads as cores
         remedy = f"set OMP_NUM_THREADS={allowed} before you start JupyterLab"
         yield Line(AMBER, "cores", f"{cores}, of which the container may use {allowed}", remedy)
     elif cores == 1:
-        yield Line(
-            AMBER,
-            "cores",
-            "1",
-            "all works, at half the stated speed or less: add --set processes=1 to train",
-        )
+        yield Line(AMBER, "cores", "1", "all works, more slowly: add --processes 1 to train")
     else:
         yield Line(GREEN, "cores", f"{cores}")
 
 
 def check_memory() -> Iterator[Line]:
-    """Memory that is free, within the limit of a container where there is one."""
+    """Memory that is free, within the limit of a container."""
     import psutil
 
     free = psutil.virtual_memory().available
     limit, used, statistics = (LIMITS / f"memory.{name}" for name in ("max", "current", "stat"))
     if limit.exists() and limit.read_text().strip().isdigit():
-        # Pages of files that were read count as used there, though the system gives them back when they are wanted.
-        counts = (
-            dict(line.split() for line in statistics.read_text().splitlines())
-            if statistics.exists()
-            else {}
-        )
-        free = min(
-            free,
-            int(limit.read_text()) - int(used.read_text()) + int(counts.get("inactive_file", 0)),
-        )
-    remedy = "close other programs and shut down notebooks that you no longer use (Kernel > Shut Down All Kernels)"
+        # Files that were read count as used there, but the system frees their pages when needed.
+        lines = statistics.read_text().splitlines() if statistics.exists() else []
+        cached = int(dict(line.split() for line in lines).get("inactive_file", 0))
+        free = min(free, int(limit.read_text()) - int(used.read_text()) + cached)
+    remedy = "close other programs, and notebooks (Kernel > Shut Down All Kernels)"
     yield graded("free memory", free / 1e9, amber=2.0, red=0.7, remedy=remedy)
 
 
 def check_folder(folder: Path) -> Iterator[Line]:
     """Space on the disk of the working folder, and the right to write there."""
     if not folder.is_dir():
-        yield Line(
-            RED,
-            "working folder",
-            f"{folder}: there is no such folder",
-            "make it, or name another one",
-        )
+        yield Line(RED, "working folder", f"{folder}: there is no such folder", "make it")
         return
-    remedy = "make room, or work on another disk; random episodes of the laptop settings take up to 1.4 GB"
-    yield graded(
-        "free disk", shutil.disk_usage(folder).free / 1e9, amber=3.0, red=0.3, remedy=remedy
-    )
+    remedy = "make room, or work on another disk: a laptop training takes up to 1.4 GB"
+    free = shutil.disk_usage(folder).free / 1e9
+    yield graded("free disk", free, amber=3.0, red=0.3, remedy=remedy)
     try:
         with tempfile.TemporaryFile(dir=folder):
             yield Line(GREEN, "working folder", "may be written to")
     except OSError as error:
-        yield Line(
-            RED,
-            "working folder",
-            f"{folder.resolve()}: {error}",
-            "copy the notebooks to a folder of your own",
-        )
+        remedy = "copy the notebooks to a folder of your own"
+        yield Line(RED, "working folder", f"{folder.resolve()}: {error}", remedy)
 
 
 def graded(name: str, found: float, amber: float, red: float, remedy: str) -> Line:
@@ -346,54 +275,32 @@ def graded(name: str, found: float, amber: float, red: float, remedy: str) -> Li
 
 
 def check_gpu() -> Iterator[Line]:
-    """A GPU is never needed; where there is one, V and M train on it."""
+    """Whether V and M can train on a GPU; none is needed."""
     import torch
 
     if not torch.cuda.is_available():
         yield Line(GREEN, "GPU", "none, and none is needed")
         return
-    name = "there is one that"  # until it tells its name
+    name = "a GPU"  # until its name is known
     try:
-        name, (major, minor) = torch.cuda.get_device_name(), torch.cuda.get_device_capability()
-        nvidia = [kind for kind in torch.cuda.get_arch_list() if kind.startswith("sm_")]
-        built = [int(kind[3:].rstrip("af")) for kind in nvidia]
-        if built and 10 * major + minor < min(built):
-            remedy = "none is needed; for this one install a PyTorch that is built for an older CUDA, see pytorch.org"
-            yield Line(
-                AMBER,
-                "GPU",
-                f"{name} is too old for this PyTorch: V and M train on the CPU",
-                remedy,
-            )
-            return
-        torch.ones(1, device="cuda").add_(1).item()  # as `training.training_device` does
+        name = torch.cuda.get_device_name()
+        torch.ones(1, device="cuda").add_(1).item()  # as `trainer.training_device` does
         yield Line(GREEN, "GPU", name)
-    except (RuntimeError, AssertionError) as error:
-        remedy = "none is needed; see whether another process has taken it"
-        yield Line(
-            AMBER, "GPU", f"{name} cannot be used now, so V and M train on the CPU: {error}", remedy
-        )
+    except (RuntimeError, AssertionError) as error:  # too old for this PyTorch, or in use
+        found = f"{name} cannot be used, so V and M train on the CPU: {error}"
+        remedy = "none is needed; end what uses it, or see pytorch.org for an older CUDA"
+        yield Line(AMBER, "GPU", found, remedy)
 
 
 def check_widgets() -> Iterator[Line]:
-    """Whether JupyterLab, if started from this environment, can show sliders."""
+    """Whether JupyterLab, if started from this environment, can show widgets."""
+    if not importlib.util.find_spec("jupyter_core"):
+        return  # without notebooks
     from jupyter_core.paths import jupyter_path
 
-    folders = [
-        Path(folder, "@jupyter-widgets", "jupyterlab-manager")
-        for folder in jupyter_path("labextensions")
-    ]
-    if any(folder.exists() for folder in folders):
-        yield Line(
-            GREEN,
-            "widgets",
-            f"JupyterLab's widget manager {version('jupyterlab_widgets')} is installed",
-        )
+    folders = [Path(folder, "@jupyter-widgets") for folder in jupyter_path("labextensions")]
+    if any((folder / "jupyterlab-manager").exists() for folder in folders):
+        yield Line(GREEN, "widgets", f"jupyterlab_widgets {version('jupyterlab_widgets')}")
     else:
-        remedy = "pip install --force-reinstall jupyterlab_widgets, then start JupyterLab anew; the figures show without it"
-        yield Line(
-            AMBER,
-            "widgets",
-            "JupyterLab's widget manager is missing: sliders stay invisible",
-            remedy,
-        )
+        remedy = "pip install --force-reinstall jupyterlab_widgets, then start JupyterLab again"
+        yield Line(AMBER, "widgets", "jupyterlab_widgets is missing: no slider is shown", remedy)

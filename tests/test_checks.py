@@ -1,4 +1,4 @@
-"""The instant checks: right answers pass, wrong ones are told what is wrong, near misses are not let through."""
+"""The checks of exercises: right answers pass, wrong and nearly right ones get a diagnosis."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_a_right_answer_passes_and_says_so(capsys):
     [
         (None, "f.x. is None: end your function with `return`"),
         ([0.5, -2.0, 3.0], "is a list: expected an array"),
-        (torch.from_numpy(RIGHT), "is a tensor: expected an array, which .numpy"),
+        (torch.from_numpy(RIGHT), "is a tensor: expected an array: use .numpy"),
         ("0.5", "is of type str"),
         (RIGHT[:2], r"found shape \(2,\), expected \(3,\)"),
         (RIGHT[None], r"found shape \(1, 3\), expected \(3,\)"),
@@ -35,7 +35,7 @@ def test_a_right_answer_passes_and_says_so(capsys):
         (np.full(2, np.nan), "two NaN"),
     ],
 )
-def test_a_wrong_answer_is_told_what_is_wrong(found, message):
+def test_a_wrong_answer_gets_a_diagnosis(found, message):
     with pytest.raises(AssertionError, match=message):
         check(
             "f(x)",
@@ -60,19 +60,19 @@ def test_a_wrong_answer_is_told_what_is_wrong(found, message):
         ([5.0, np.nan], [1.0, np.nan], r"found 5 at index \(0,\), expected 1"),
     ],
 )
-def test_answers_that_are_not_finite_are_told_what_is_wrong(found, expected, message):
+def test_answers_that_are_not_finite_get_a_diagnosis(found, expected, message):
     with pytest.raises(AssertionError, match=message):
         check("f(x)", np.array(found), np.array(expected))
 
 
-def test_a_list_of_tensors_that_keep_their_gradients_is_told_so():
+def test_a_list_of_tensors_with_gradients_is_refused():
     with pytest.raises(
-        AssertionError, match=r"this is no array, and cannot be made one: .*requires grad"
+        AssertionError, match=r"this is no array, and cannot become one: .*requires grad"
     ):
         check("the answer", [torch.ones(2, requires_grad=True)], [[1.0, 1.0]])
 
 
-def test_a_list_of_unequal_parts_is_told_so():
+def test_a_list_of_unequal_parts_is_refused():
     with pytest.raises(AssertionError, match="parts differ in length"):
         check("f(x)", [[1, 2], [3]], [[1, 2], [3, 4]])
 
@@ -86,3 +86,16 @@ def test_the_tolerance_is_a_share_of_the_largest_number():
     check("f(x)", np.array([0.0, 1000.09]), np.array([0.0, 1000.0]))
     with pytest.raises(AssertionError, match=r"found 1000\.2"):
         check("f(x)", np.array([0.0, 1000.2]), np.array([0.0, 1000.0]))
+
+
+def test_small_answers_are_not_taken_for_zero():
+    small = np.array([2e-6, -5e-6])
+    check("f(x)", small * (1 + 1e-5), small)
+    check("f(x)", np.zeros(2), np.zeros(2))
+    for wrong in (np.zeros(2), small * 1.001, small[::-1]):
+        with pytest.raises(AssertionError, match="found"):
+            check("f(x)", wrong, small)
+    with pytest.raises(AssertionError, match=r"found 0, expected 3e-05"):
+        check("f(x)", 0.0, 3e-5)
+    with pytest.raises(AssertionError, match="half"):
+        check("f(x)", small / 2, small, {"half": small / 2})

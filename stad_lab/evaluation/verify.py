@@ -177,8 +177,9 @@ def verify_evaluations(folder: Path) -> str:
     """Check the evaluations in the folder, and that they are of this C."""
     files = sorted(folder.glob("evaluation*.json"))
     for file in files:
-        parameters, _ = load_controller(folder / CONTROLLER_FILE)
-        if load_evaluation(file)["controller"] != checksum_of_arrays(parameters=parameters):
+        parameters, metadata = load_controller(folder / CONTROLLER_FILE)
+        found, drove = load_evaluation(file), checksum_of_arrays(parameters=parameters)
+        if (found["controller"], found["variant"]) != (drove, metadata["variant"]):
             raise ValueError(f"{file} is of another controller: evaluate again")
     return f"ok: {', '.join(file.name for file in files)}" if files else "none: not evaluated here"
 

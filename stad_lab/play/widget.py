@@ -1,38 +1,30 @@
-"""The seat in the browser: a `play.Session` with keys, buttons and a picture that moves. Needs a running kernel.
+"""The driving widget: a `Session` with keys, buttons and a moving picture. Needs a running kernel.
 
-The loop is a thread of the kernel, so that other cells run while the car drives. ipyevents tells when a key goes down
-*and* when it comes up, as long as the pointer rests on the picture; the frame around the picture shows that it does.
+The loop is a thread of the kernel, so other cells run while the car drives. keys.js, which runs in
+the page, decides which keys belong to the game, and sends the pedals that are held.
 """
 
 import html
 import threading
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import ipywidgets
-from ipyevents import Event
 
-from stad_lab.play.session import KEYS, Session
+from stad_lab.play.session import LAST_TRACK, Session
 from stad_lab.viz.plots import ORANGE
 from stad_lab.viz.widgets import picture_png
 
 PICTURE_SIZE = 448  # pixels on the page
-FRAME_IDLE, FRAME_LISTENING = "4px solid transparent", f"4px solid {ORANGE}"
-LONGEST_WAIT = (
-    0.2  # seconds that the car waits for a browser which has not shown the last pictures yet
-)
-PRESSED, RELEASED = (
-    ("mousedown", "touchstart"),
-    ("mouseup", "mouseleave", "touchend", "touchcancel"),
-)
-PEDAL_ICONS = {
-    "gas": "arrow-up",
-    "left": "arrow-left",
-    "brake": "arrow-down",
-    "right": "arrow-right",
-}
-HELP = """<style>.stad-lab-pixels {image-rendering: pixelated}</style><div style="line-height: 1.4">
-Rest the pointer on the picture: an orange frame says that the keys drive. <b>Arrows</b> or <b>WASD</b> steer, give gas
-and brake; <b>T</b> takes the wheel from the agent or gives it back; <b>P</b> drives and pauses.</div>"""
+LONGEST_WAIT = 0.2  # seconds to wait for a browser that has not shown the last pictures
+PEDAL_ICONS = {"gas": "up", "left": "left", "brake": "down", "right": "right"}
+HELP = f"""<style>.stad-lab-wire, .stad-lab-swap {{display: none}}
+.stad-lab-pixels {{image-rendering: pixelated; max-width: none; border: 4px solid transparent}}
+.stad-lab-pixels.stad-lab-listening {{border-color: {ORANGE}}}</style>
+<div style="line-height: 1.4">In an orange frame, the keys drive: from <b>drive</b> until <b>P</b>
+(pause) or <b>Esc</b>, and with the pointer on the picture. <b>Arrows</b> or <b>WASD</b> steer, give
+gas and brake; <b>T</b> hands over between you and the agent.</div>"""
 
 
 class Loop(threading.Thread):
@@ -43,19 +35,15 @@ class Loop(threading.Thread):
         self.seat, self.stopped = seat, threading.Event()
 
     def run(self) -> None:
-        """What the thread does; an error ends the loop and is shown on the page."""
+        """The thread's work; an error ends the loop and is shown on the page."""
         due = before = time.perf_counter()
         try:
             while not self.stopped.is_set() and self.seat.advance():
                 now = time.perf_counter()
                 self.seat.pace = 1 / (0.9 / self.seat.pace + 0.1 * max(now - before, 1e-3))
-                due, before = (
-                    max(due + 1 / self.seat.speed.value, now - 0.1),
-                    now,
-                )  # a short delay is made good
-                self.stopped.wait(
-                    max(due - now, 0.002)
-                )  # never without a pause: the kernel must hear the keys
+                due = max(due + 1 / self.seat.speed.value, now - 0.1)  # catches up short delays
+                before = now
+                self.stopped.wait(max(due - now, 0.002))  # always a pause: the kernel reads keys
                 patience = time.perf_counter() + LONGEST_WAIT
                 while self.seat.browser_is_behind() and time.perf_counter() < patience:
                     self.stopped.wait(0.005)
@@ -66,7 +54,7 @@ class Loop(threading.Thread):
 
 
 def stop_loops() -> None:
-    """Stop whatever drives in this kernel: the cell that is run again leaves no car on the road behind it."""
+    """Stop every loop of this kernel, so that a cell that runs again leaves none behind."""
     for thread in threading.enumerate():
         if isinstance(thread, Loop):
             thread.stopped.set()
@@ -74,120 +62,86 @@ def stop_loops() -> None:
 
 
 def drive_yourself(session: Session) -> ipywidgets.Widget:
-    """The seat of a session, with keys, buttons and sliders. At most one car drives in a kernel: the one started last.
-
-    The session goes on belonging to the caller, who may look at its drives in other cells at any time.
-    """
+    """The widget of a session, which other cells may read; a kernel drives the last one started."""
     return Seat(session).view
 
 
 class Seat:
-    """The controls of a session and the picture, wired together.
-
-    Attributes:
-        view: all of it, the widget that a cell shows.
-        pace: pictures that the loop has lately made in a second.
-    """
+    """The controls of a session and its picture; `view` is all of it, `pace` pictures a second."""
 
     def __init__(self, session: Session):
         stop_loops()
         self.session, self.loop, self.pace, self.error = session, None, 0.0, ""
-        self.lock, self.told = (
-            threading.RLock(),
-            0.0,
-        )  # of the session; when the status was last written
-        self.picture = ipywidgets.Image(format="png", width=PICTURE_SIZE, height=PICTURE_SIZE)
-        self.picture.layout = {"border": FRAME_IDLE, "max_width": "none"}
-        self.picture.add_class("stad-lab-pixels")
+        self.lock, self.described = threading.RLock(), 0.0  # when the status was last written
+        size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE}
+        self.picture = marked(ipywidgets.Image(format="png", **size), "pixels")
         self.status = ipywidgets.HTML()
-        self.go = ipywidgets.ToggleButton(
-            description="drive", icon="play", layout={"width": "240px"}
-        )
+        self.go = marked(ipywidgets.ToggleButton(description="drive", icon="play"), "drive")
         self.driver = choice({"you": "hand", "the agent": "agent"}, session.driver)
         self.world = choice({"the real track": "real", "the dream": "dream"}, session.world)
-        self.temperature = ipywidgets.FloatSlider(
-            session.dream.temperature, min=0.1, max=2.5, step=0.05
-        )
+        temperature = session.dream.temperature
+        self.temperature = ipywidgets.FloatSlider(temperature, min=0.1, max=2.5, step=0.05)
         self.speed = ipywidgets.IntSlider(30, min=10, max=50)
-        self.track = ipywidgets.BoundedIntText(
-            session.track, min=0, max=999_999, layout={"width": "110px"}
-        )
-        self.begin = ipywidgets.Button(description="begin", icon="flag", layout={"width": "124px"})
-        # The browser copies every tenth picture's number back: without an answer, pictures would pile up in a slow one.
+        self.track = ipywidgets.BoundedIntText(session.track, min=0, max=LAST_TRACK)
+        self.begin = ipywidgets.Button(description="begin", icon="flag")
+        self.wire = marked(ipywidgets.Text(), "wire")  # the held pedals, from keys.js
+        self.swap = marked(ipywidgets.Button(), "swap")  # what keys.js clicks for T
+        # The browser copies every tenth picture's number back, and the loop waits for it: otherwise
+        # pictures would pile up in a slow browser.
         self.shown, self.sent, self.seen = 0, ipywidgets.IntText(), ipywidgets.IntText()
         self.answer = ipywidgets.jsdlink((self.sent, "value"), (self.seen, "value"))
         self._connect()
         self.show()
-        self.view = ipywidgets.Box(
-            [self.picture, self._controls()], layout={"flex_flow": "row wrap"}
-        )
+        self.view = marked(ipywidgets.Box([self.picture, self._controls(), script()]), "seat")
+        self.view.layout.flex_flow = "row wrap"
 
     def _controls(self) -> ipywidgets.VBox:
-        pedals = {pedal: self._pedal(pedal, icon) for pedal, icon in PEDAL_ICONS.items()}
-        below = ipywidgets.HBox([pedals["left"], pedals["brake"], pedals["right"]])
-        rows = [
-            self.status,
-            self.go,
-            self.driver,
-            self.world,
-            named("temperature of the dream", self.temperature),
-            named("frames a second (the real car: 50)", self.speed),
-            named("track", ipywidgets.HBox([self.track, self.begin])),
-            ipywidgets.VBox(
-                [pedals["gas"], below], layout={"align_items": "center", "width": "240px"}
-            ),
-            ipywidgets.HTML(HELP),
-        ]
+        size = {"width": "76px", "height": "40px"}
+        gas, *others = (
+            marked(ipywidgets.Button(icon=f"arrow-{icon}", tooltip=pedal, layout=size), pedal)
+            for pedal, icon in PEDAL_ICONS.items()
+        )
+        for control, width in ((self.go, 240), (self.track, 110), (self.begin, 124)):
+            control.layout.width = f"{width}px"
+        cross = {"align_items": "center", "width": "240px"}
+        rows = [self.status, self.go, self.driver, self.world]
+        rows += [ipywidgets.Label("temperature of the dream"), self.temperature]
+        rows += [ipywidgets.Label("frames a second (the real car: 50)"), self.speed]
+        rows += [ipywidgets.Label("track"), ipywidgets.HBox([self.track, self.begin])]
+        rows += [ipywidgets.VBox([gas, ipywidgets.HBox(others)], layout=cross)]
+        rows += [ipywidgets.HTML(HELP), self.wire, self.swap]
         return ipywidgets.VBox(rows, layout={"width": "330px", "margin": "0 0 0 16px"})
 
-    def _pedal(self, pedal: str, icon: str) -> ipywidgets.Button:
-        """A button that holds its pedal for as long as a mouse or a finger holds the button."""
-        button = ipywidgets.Button(
-            icon=icon, tooltip=pedal, layout={"width": "76px", "height": "40px"}
-        )
-        event = Event(
-            source=button, watched_events=[*PRESSED, *RELEASED], prevent_default_action=True
-        )
-        event.on_dom_event(lambda happened: self.press(pedal, happened["type"] in PRESSED))
-        return button
-
     def _connect(self) -> None:
-        self.go.observe(lambda change: self.drive(change["new"]), "value")
-        self.driver.observe(lambda change: self._command(self.session.give, change["new"]), "value")
-        self.world.observe(lambda change: self._command(self.session.enter, change["new"]), "value")
-        self.temperature.observe(
-            lambda change: setattr(self.session.dream, "temperature", change["new"]), "value"
-        )
+        acts = {self.go: self.drive, self.wire: self.hold}
+        acts[self.driver] = lambda driver: self._command(self.session.give, driver)
+        acts[self.world] = lambda world: self._command(self.session.enter, world)
+        acts[self.temperature] = lambda value: setattr(self.session.dream, "temperature", value)
+        for control, act in acts.items():
+            control.observe(lambda change, act=act: act(change["new"]), "value")
+        self.swap.on_click(lambda _: self.change_driver())
         self.begin.on_click(lambda _: self.begin_track())
-        watched = ["keydown", "keyup", "mouseenter", "mouseleave"]
-        self.keys = Event(source=self.picture, watched_events=watched, prevent_default_action=True)
-        self.keys.on_dom_event(self.on_event)
 
-    def on_event(self, event: dict) -> None:
-        """What the browser saw on the picture: a key that went down or up, the pointer that came or left."""
-        kind, key = event["type"], event.get("code")
-        if kind in ("mouseenter", "mouseleave"):
-            self.picture.layout.border = FRAME_LISTENING if kind == "mouseenter" else FRAME_IDLE
-            self.session.hand.held.clear()  # a key that comes up elsewhere is not seen
-        elif key in KEYS:
-            self.press(KEYS[key], kind == "keydown")
-        elif kind == "keydown" and not event.get("repeat") and key == "KeyP":
-            self.go.value = not self.go.value
-        elif kind == "keydown" and not event.get("repeat") and key == "KeyT":
-            self._command(self.session.give, "agent" if self.session.driver == "hand" else "hand")
-            self.driver.value = (
-                self.session.driver
-            )  # the buttons may have been behind: another cell can `give`
+    def hold(self, pedals: str) -> None:
+        """Hold these pedals, "gas left" for example, and release all others."""
+        self.session.hand.hold(*pedals.split())
+        self.described = 0.0  # the loop shows it with the next picture
 
-    def press(self, pedal: str, down: bool) -> None:
-        """Hold a pedal, or let it go."""
-        (self.session.hand.held.add if down else self.session.hand.held.discard)(pedal)
-        self.told = 0.0  # so that the loop tells at once
+    def change_driver(self) -> None:
+        """Hand over between human and agent; another cell may have done so since the last time."""
+        self._command(self.session.give, "agent" if self.session.driver == "hand" else "hand")
+        self.driver.value = self.session.driver
 
     def drive(self, on: bool) -> None:
-        """Start the loop, or pause it. A loop that another seat may have is stopped."""
+        """Start the loop, or pause it. Any other seat's loop is stopped.
+
+        When an episode ends by itself, the game keeps the keys: one that is still held would be a
+        command of JupyterLab.
+        """
+        if not self.session.ended:
+            (self.view.add_class if on else self.view.remove_class)("stad-lab-driving")
         if on:
-            self.loop = None  # a loop that is still on its way out has no say any more
+            self.loop = None  # a loop that is still ending must not change the new one's state
             stop_loops()
             self.loop, self.pace, self.error = Loop(self), float(self.speed.value), ""
             self.loop.start()
@@ -201,7 +155,7 @@ class Seat:
         self.world.value, self.go.value = "real", True
 
     def advance(self) -> bool:
-        """One frame, shown; False if the episode has ended."""
+        """Drive and show one frame; False if the episode has ended."""
         with self.lock:
             if not self.session.ended:
                 self.session.step()
@@ -209,61 +163,60 @@ class Seat:
         return not self.session.ended
 
     def loop_ended(self, loop: Loop) -> None:
-        """What a loop says when it is over."""
+        """What a loop calls at its end."""
         if loop is self.loop:
             self.go.value = False
         self.show()
 
     def show(self, every: float = 0.0) -> None:
-        """Show the present picture, and the status unless it was written less than `every` seconds ago."""
+        """Show the picture, and the status unless it is younger than `every` seconds."""
         with self.lock:
             picture = self.session.picture()
         self.picture.value = picture_png(picture, len(picture))
         self.shown += 1
         if self.shown % 10 == 0:  # an answer costs the page as much as some pictures
             self.sent.value = self.shown
-        if time.perf_counter() - self.told > every:
-            self.told = time.perf_counter()
-            self.status.value = describe(
-                self.session, self.pace if self.go.value else 0.0, self.error
-            )
+        if time.perf_counter() - self.described > every:
+            self.described = time.perf_counter()
+            pace = self.pace if self.go.value else 0.0
+            self.status.value = describe(self.session, pace, self.error)
 
     def browser_is_behind(self) -> bool:
         """Whether a browser is there and has not answered for more than 15 pictures."""
         return 0 < self.seen.value < self.shown - 15
 
-    def _command(self, do, value) -> None:
+    def _command(self, act: Callable, value: object) -> None:
         with self.lock:
-            do(value)
+            act(value)
         self.show()
 
 
 def describe(session: Session, pace: float, error: str = "") -> str:
-    """Who drives where, the score, and the pictures a second, as HTML."""
-    who = "You drive" if session.driver == "hand" else "The agent drives"
+    """The driver, the place, the score and the pictures a second, as HTML."""
+    driver = "You drive" if session.driver == "hand" else "The agent drives"
     if session.world == "real":
-        where, count = f"on track {session.track}", len(session.rows)
+        place, count = f"on track {session.track}", len(session.rows)
         score = f"{session.score:.1f} points"
     else:
-        where, count = "in the dream", len(session.dream_rows)
-        score = "no points in the dream"
-    state = (
-        "the episode has ended"
-        if session.ended
-        else f"{pace:.0f} pictures a second"
-        if pace
-        else "paused"
-    )
+        place, count, score = "in the dream", len(session.dream_rows), "no points in the dream"
+    state = f"{pace:.0f} pictures a second" if pace else "paused"
+    state = "the episode has ended" if session.ended else state
     held = ", ".join(sorted(session.hand.held)) or "none"
-    line = f"<b>{who} {where}</b><br>{score}, frame {count}, {state}<br>keys held: {held}"
-    return f'<div style="line-height: 1.4">{line}{f"<br><b>{html.escape(error)}</b>" if error else ""}</div>'
+    lines = [f"<b>{driver} {place}</b>", f"{score}, frame {count}, {state}", f"keys held: {held}"]
+    lines += [f"<b>{html.escape(error)}</b>"] if error else []
+    return f'<div style="line-height: 1.4">{"<br>".join(lines)}</div>'
 
 
-def named(name: str, control: ipywidgets.Widget) -> ipywidgets.VBox:
-    """A control under its name."""
-    return ipywidgets.VBox(
-        [ipywidgets.Label(name, layout={"margin": "0", "height": "20px"}), control]
-    )
+def marked(widget: ipywidgets.DOMWidget, name: str) -> ipywidgets.DOMWidget:
+    """The widget, with a class by which keys.js finds it."""
+    return widget.add_class(f"stad-lab-{name}")
+
+
+def script() -> ipywidgets.Output:
+    """keys.js as an output, which JupyterLab runs when it shows it."""
+    data = {"application/javascript": Path(__file__).with_name("keys.js").read_text("utf-8")}
+    output = {"output_type": "display_data", "data": data, "metadata": {}}
+    return ipywidgets.Output(outputs=(output,))
 
 
 def choice(options: dict[str, str], value: str) -> ipywidgets.ToggleButtons:

@@ -1,158 +1,120 @@
-"""The rows of the replication's table: a variant, a recipe and some seeds each.
+"""The experiments of the replication: a configuration (with its variant) and some seeds each.
 
-`stad_lab.replication.run` makes them, and `stad_lab.replication.tables` says what came out.
+Those that we report used pycma 4.5, which adapts sigma by two points (TPA) from 300 searched
+dimensions on, and by cumulative path length (CSA) below; the configurations state which.
 """
 
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from stad_lab.config import Settings
-from stad_lab.models.vae import VARIANTS
-from stad_lab.training.fine_tuning import FINISH
+from stad_lab.config import VARIANTS, Config
+from stad_lab.training.fine_tuning import FINE_TUNING
 
-FLOORS = {  # rows of drivers that do not look at the road
-    "random_driver": "smooth random steering and gas, as for the rollouts",
-    "gentle_driver": "straight on with little gas, as the first agent that evolution tries",
+BASELINE_DRIVERS = {  # they do not see the road, and have no seeds
+    "random_driver": "smooth random steering and gas, as in the dataset",
+    "constant_driver": "straight on with little gas, as the first controller of CMA-ES",
 }
-EARLY = (0, 1, 2, 3, 4)  # seeds of the rows whose runs are short, and whose scores scatter the most
-NO_BAR_SEEDS = (0, 1)
+RECIPES = {  # each is run with all four variants, as the experiments RECIPE_VARIANT
+    "paper": "the paper's recipe, one episode per agent",
+    "two_iterations": "two iterations of the world model",
+    "fine_tuned": "two iterations and fine-tuning",
+    "first_iteration": "the first of the two iterations",
+    "no_bar": "one iteration, without the indicator bar",
+}
+
+
+def evolution(**changes) -> dict:
+    """Changes of the settings of CMA-ES, for `Config.replace`."""
+    return {"evolution": changes}
+
+
+SECOND_ITERATION = evolution(generations=40, sigma=0.05, replay_share=0.5)
+SECOND_ITERATION |= {"data": {"agent_episodes": 110}}
+EARLY_RECIPE = {"data": {"crop_bar": True}} | evolution(
+    population=16, tracks=4, replay_share=0.0,
+    components=0, sigma_decay=0.0, step_size_rule="TPA",
+)  # fmt: skip
+# Single changes of "one_iteration": the experiment whose dataset, V and M are shared (None: own
+# ones) -> experiment -> (what it is, the change). The variant is `input`.
+CHANGES = {
+    None: {
+        "another_seed": ("everything from another seed", {"seed": 1}),
+        **{f"stride_{k}": (f"stride {k}", {"vae": {"stride": k}}) for k in (1, 2, 8)},
+        **{f"latent_{n}": (f"{n} latents", {"vae": {"latent_size": n}}) for n in (16, 64)},
+    },
+    "one_iteration": {
+        "z_only": ("C sees z alone", evolution(features="z")),
+        "h_only": ("C sees h alone", evolution(features="h")),
+        "untrained_mdn_rnn": ("M is not trained", {"mdn_rnn": {"steps": 0}}),
+        "small_population": ("16 agents on 4 tracks each", evolution(population=16, tracks=4)),
+    },
+    "another_seed": {
+        "last_mean": ("the last CMA mean, not an average", evolution(averaged_share=0.0)),
+        "all_weights": ("all weights searched", evolution(components=0, step_size_rule="TPA")),
+        "adaptive_sigma": ("step size adapted by CMA-ES", evolution(sigma_decay=0.0)),
+    },
+}
 
 
 @dataclass(frozen=True)
-class Row:
-    """One row of the table."""
+class Experiment:
+    """What is run for one line of the results."""
 
-    variant: str
     about: str
-    """What is special about it, for the reader."""
-    settings: Settings
-    """Of the only round, of the second, or of the finish."""
-    first: Settings | None = None
-    """Of the first round, in a recipe of two."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Of the searches for C. V and M, and a first round, are made once."""
-    world: str | None = None
-    """Name of the row whose rollouts, V and M it shares; None for its own."""
-    base: str | None = None
-    """Name of the row whose searches it goes on from, seed by seed, with a finish."""
-    retrained: bool = False
-    """Whether each seed is a whole run, with rollouts, V and M of its own."""
+    config: Config  # of the only iteration of V and M, of the second, or of the fine-tuning
+    first: Config | None = None  # of the first iteration, where there are two
+    seeds: tuple[int, ...] = (0, 1, 2)  # of CMA-ES; V and M are trained once for all of them
+    world_model: str | None = None  # experiment whose dataset, V and M it shares; None: its own
+    base: str | None = None  # experiment whose runs it fine-tunes, seed by seed
+    retrained: bool = False  # each seed is a whole run, with its own dataset, V and M
 
-    def settings_of(self, seed: int) -> Settings:
-        """The settings of one of its seeds."""
-        return dataclasses.replace(
-            self.settings, evolution_seed=seed, seed=seed if self.retrained else self.settings.seed
-        )
+    def config_of(self, seed: int) -> Config:
+        """The configuration of one seed."""
+        own = seed if self.retrained else self.config.seed
+        return self.config.replace(seed=own, **evolution(seed=seed))
 
 
-def make_rows() -> dict[str, Row]:
-    """All rows of the table by name."""
-    rows = {}
-    for variant in VARIANTS:
-        rows[f"paper_{variant}"] = Row(variant, "the paper's recipe", Settings.preset("paper"))
-    # 900 + 55 x 64 + 11 x 16: 4,596 episodes.
-    one = Settings.preset("laptop", crop_bar=False)
-    # 900 + 15 x 64 + 3 x 16 episodes in the first round, 110 + 40 x 64 + 8 x 16 in the second: 4,706 in all.
-    first = dataclasses.replace(one, generations=15)
-    second = dataclasses.replace(
-        first, agent_episodes=110, generations=40, sigma=0.05, revisited_share=0.5
-    )
-    for variant in VARIANTS:
-        rows[f"two_rounds_{variant}"] = Row(variant, "our recipe", second, first)
-    # Before the ceiling: 900 + 15 x 64 + 3 x 16 = 1,908 episodes.
-    for variant in VARIANTS:
-        rows[f"early_{variant}"] = Row(
-            variant, "the first round of our recipe", first, seeds=EARLY, retrained=True
-        )
-    # 15 x 256 + 3 x 16 episodes more, and 480 agents: 8,594 episodes and 4,000 agents in all.
-    finished = dataclasses.replace(second, **FINISH)
-    for variant in VARIANTS:
-        base = f"two_rounds_{variant}"
-        rows[f"finished_{variant}"] = Row(variant, "our recipe and a finish", finished, base=base)
-    longer = dataclasses.replace(second, generations=160, sigma_decay=0.99)
-    rows["long_input"] = Row(
-        "input", "our recipe, four times as long", longer, first, (0,), "two_rounds_input"
-    )
-    never_back = dataclasses.replace(second, revisited_share=0.0)
-    rows["two_rounds_new_tracks"] = Row(
-        "input", "our recipe, new tracks alone", never_back, first, seeds=(0,)
-    )
-    before = [dataclasses.replace(settings, **BEFORE) for settings in (second, first)]
-    rows["two_rounds_few_agents"] = Row(
-        "input", "our recipe before it was improved", *before, seeds=(0,)
-    )
-    rows["one_round"] = Row("input", "one round", one)
-    for name, (about, changes, world) in ABLATIONS.items():
-        settings = dataclasses.replace(rows[world or "one_round"].settings, **changes)
-        rows[name] = Row("input", about, settings, seeds=(0,), world=world)
-    # What counts there is the luck of V, so each seed has its own.
-    rows["no_bar"] = dataclasses.replace(rows["no_bar"], seeds=NO_BAR_SEEDS, retrained=True)
-    for variant, what in NO_BAR.items():
-        about = f"{rows['no_bar'].about}, {what}"
-        rows[f"no_bar_{variant}"] = dataclasses.replace(
-            rows["no_bar"], variant=variant, about=about
-        )
-    return rows
+def make_experiments() -> dict[str, Experiment]:
+    """All experiments by name."""
+    found = {}
+    for name in VARIANTS:
+        paper = Config.preset("paper", variant=name, **evolution(step_size_rule="TPA"))
+        no_bar = Config.preset("laptop", variant=name)
+        first = no_bar.replace(data={"crop_bar": False}, **evolution(generations=15))
+        two = first.replace(**SECOND_ITERATION)
+        tuned, base = two.replace(**FINE_TUNING), f"two_iterations_{name}"
+        for recipe, fields in {
+            "paper": {"config": paper},
+            "two_iterations": {"config": two, "first": first},
+            "fine_tuned": {"config": tuned, "base": base},
+            "first_iteration": {"config": first, "seeds": (0, 1, 2, 3, 4), "retrained": True},
+            "no_bar": {"config": no_bar, "seeds": (0, 1), "retrained": True},
+        }.items():
+            found[f"{recipe}_{name}"] = Experiment(RECIPES[recipe], **fields)
+    base = found["two_iterations_input"]
+    one_iteration = base.first.replace(**evolution(generations=55))
+    found["one_iteration"] = Experiment("one iteration", one_iteration)
+    for world_model, changed in CHANGES.items():
+        for name, (about, changes) in changed.items():
+            config = found[world_model or "one_iteration"].config.replace(**changes)
+            found[name] = Experiment(about, config, None, (0,), world_model)
+    only_new, about = base.config.replace(**evolution(replay_share=0.0)), "two iterations, "
+    early = [one.replace(**EARLY_RECIPE) for one in (base.config, base.first)]
+    return found | {
+        "no_replay": Experiment(about + "new tracks only", only_new, base.first, (0,)),
+        "early_recipe": Experiment(about + "before the recipe was improved", *early, (0,)),
+    }
 
 
-# Our recipe before it was improved.
-BEFORE = {
-    "population": 16,
-    "tracks": 4,
-    "revisited_share": 0.0,
-    "components": 0,
-    "sigma_decay": 0.0,
-    "crop_bar": True,
-}
-# Name -> what it is, the change, and the row that it changes and whose V and M it shares; None for "one_round" with a
-# V and an M of its own. V and M of "one_round" come from a kind of processor that not everybody has, and without them
-# a row could be compared with nothing: so "another_V" is the same recipe, made where the rows that share it are made.
-ABLATIONS = {
-    "no_M": ("one round, C sees z alone", {"features": "z"}, "one_round"),
-    "no_z": ("one round, C sees h alone", {"features": "h"}, "one_round"),
-    "untrained_M": ("one round, M's weights are random", {"m_steps": 0}, "one_round"),
-    "few_agents": (
-        "one round, 16 agents on 4 tracks each",
-        {"population": 16, "tracks": 4},
-        "one_round",
-    ),
-    "another_V": ("one round, all of it from another seed", {"seed": 1}, None),
-    "last_mean": ("one round, the last CMA mean alone", {"averaged_share": 0.0}, "another_V"),
-    "every_weight": ("one round, every weight of C searched", {"components": 0}, "another_V"),
-    "own_sigma": ("one round, CMA-ES's own step size", {"sigma_decay": 0.0}, "another_V"),
-    "no_bar": (
-        "one round, the indicator bar cut off: the laptop settings",
-        {"crop_bar": True},
-        None,
-    ),
-    **{f"stride_{k}": (f"one round, stride {k}", {"stride": k}, None) for k in (1, 2, 8)},
-    **{f"latent_{n}": (f"one round, {n} latents", {"latent_size": n}, None) for n in (16, 64)},
-}
-# Variant of the "no_bar" recipe -> what V does with the difference image. With `input`, as "no_bar" is, it sees it.
-NO_BAR = {
-    "frame": "and no difference images",
-    "output": "and the difference image redrawn, not seen",
-    "input_output": "and the difference image seen and redrawn",
-}
-ROWS = make_rows()
+EXPERIMENTS = make_experiments()
 
 
-def is_floor(name: str, seeds: Sequence[int] | None = None) -> bool:
-    """Whether a row is one of FLOORS. Raises ValueError if seeds are wanted of one, since it has none."""
-    if name in FLOORS and seeds:
-        raise ValueError(f"row {name!r} is no search and has no seeds: leave them out")
-    return name in FLOORS
-
-
-def find_row(name: str, seeds: Sequence[int] | None = None) -> Row:
-    """The row of a name, if wanted with some of its seeds alone. Raises ValueError if there is no such row or seed."""
-    if name not in ROWS:
-        raise ValueError(f"unknown row {name!r}: choose one of {', '.join([*ROWS, *FLOORS])}")
-    row = ROWS[name]
-    for seed in seeds or ():
-        if seed not in row.seeds:
-            raise ValueError(
-                f"row {name!r} has no seed {seed}: choose of {', '.join(map(str, row.seeds))}"
-            )
-    return dataclasses.replace(row, seeds=tuple(dict.fromkeys(seeds))) if seeds else row
+def find_experiment(name: str, seeds: Sequence[int] | None = None) -> Experiment:
+    """The experiment of a name, with `seeds` alone if given; ValueError if there is none such."""
+    if name not in EXPERIMENTS:
+        raise ValueError(f"unknown experiment {name!r}: choose one of {', '.join(EXPERIMENTS)}")
+    found = EXPERIMENTS[name]
+    if unknown := set(seeds or ()) - set(found.seeds):
+        raise ValueError(f"experiment {name!r} has no seed {min(unknown)}: it has {found.seeds}")
+    return dataclasses.replace(found, seeds=tuple(dict.fromkeys(seeds))) if seeds else found

@@ -1,21 +1,18 @@
-"""The replication: every row of its table, made by one command.
+"""Runs the experiments of the replication, each by one command.
 
-`replicate` trains V and M once, searches for C once for each seed, and drives every C found on the official tracks. In
-the folder of a row of `stad_lab.replication.experiments`::
+`replicate` trains V and M once, runs CMA-ES once for each seed, and evaluates every C on the tracks
+0 to 99. In the folder of an experiment::
 
-    first/      in a recipe of two rounds: the whole first run
-    world/      rollouts, V and M
-    seed0/ ...  V, M and C of one search, with its log, record.json and evaluation.json
+    first/      in a recipe of two iterations: the whole first run
+    world/      dataset, V and M
+    seed0/ ...  V, M and C of one CMA-ES run, with its log, record.json and evaluation.json
 
-A row of finishes has neither a first round nor a world, because it goes on from the seeds of another row. In a
-`retrained` row every seed is a whole run, with a V and an M of its own. The rows of FLOORS are drivers that do not look
-at the road. Whatever is there already is not done again.
+A fine-tuning experiment has neither a first run nor a world model of its own, because it continues
+the seeds of another experiment. In a `retrained` experiment each seed is a whole run. Whatever is
+there is not done again.
 """
 
-import dataclasses
 import filecmp
-import shutil
-import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import Executor
@@ -23,337 +20,210 @@ from pathlib import Path
 
 import numpy as np
 
-from stad_lab.agent import CONTROLLER
-from stad_lab.benchmark import save_pair, train_m, train_v
-from stad_lab.config import Settings, check_same_run
-from stad_lab.envs.car_racing import MAX_FRAMES, make_env
-from stad_lab.evaluation.evaluate import SOLVED, evaluate, report
-from stad_lab.io.files import checksum, copy_file, load_json, load_tensors, save_json
-from stad_lab.io.workers import run_in_order, work_alone, worker_processes
-from stad_lab.models.controller import initial_parameters, squash
-from stad_lab.models.mdn_rnn import MDNRNN
-from stad_lab.models.vae import AutoEncoder
-from stad_lab.replication.experiments import ROWS, Row, find_row, is_floor
-from stad_lab.replication.tables import RECORDS, TOP, seed_folders, summarise_row, worlds
-from stad_lab.training.dataset import RandomDriver, collect_rollouts
-from stad_lab.training.evolution import LOG, drive_generation
-from stad_lab.training.fine_tuning import finish
-from stad_lab.training.pipeline import provenance, train
-from stad_lab.training.subspace import COMPONENTS, START
+from stad_lab.agent import rollout
+from stad_lab.config import Config, random_stream
+from stad_lab.envs.car_racing import make_env
+from stad_lab.evaluation.evaluate import KIND, evaluate, load_evaluation, report
+from stad_lab.evaluation.statistics import summarise
+from stad_lab.io.files import checksum_of_arrays, copy_file, save_json
+from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_controller
+from stad_lab.io.workers import run_in_order, single_thread, worker_processes
+from stad_lab.models.controller import squash
+from stad_lab.replication import tables
+from stad_lab.replication.experiments import (
+    BASELINE_DRIVERS,
+    EXPERIMENTS,
+    Experiment,
+    find_experiment,
+)
+from stad_lab.replication.tables import TRACKS
+from stad_lab.training.dataset import RandomDriver
+from stad_lab.training.fine_tuning import fine_tune
+from stad_lab.training.pipeline import RECORD, provenance, train
+from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE
 
-KEPT = ("record.json", LOG, "evaluation.json", CONTROLLER)  # of every run, as far as it has them
-TRACKS = 100  # official tracks, those of the seeds 0 to 99, on which every C is reported
+EVALUATION = "evaluation.json"
+Seeds = Sequence[int] | None
+"""Some seeds of an experiment; None for all."""
 
 
 def replicate(
     name: str,
     folder: str | Path,
     executor: Executor | None = None,
-    seeds: Sequence[int] | None = None,
+    seeds: Seeds = None,
 ) -> dict:
-    """Make one row of the table, or what is missing of it; run it again after an interrupt to go on.
+    """Run an experiment, or what is missing of it; call it again to continue.
 
     Args:
-        name: one of ROWS or FLOORS.
-        folder: of all rows; this one goes into `folder/name`.
+        name: one of EXPERIMENTS or BASELINE_DRIVERS.
+        folder: of all experiments; this one goes into `folder/name`.
         executor: who drives; None for processes of this machine.
-        seeds: some of the row's seeds; None for all. A floor has none.
+        seeds: some of the experiment's seeds; None for all. A baseline driver has none.
 
     Returns:
-        What `summarise_row` makes of these seeds.
+        The summary of the returns of these seeds.
 
     Raises:
-        ValueError: an unknown row or seed, or a folder with something else in it.
-        OSError, TaskError, FloatingPointError: as `train` and `evaluate`.
+        ValueError: an unknown experiment or seed, or a folder with something else in it.
     """
-    if is_floor(name, seeds):
-        return drive_floor(name, Path(folder) / name / "seed0", executor)
-    row, folder = find_row(name, seeds), Path(folder)
-    folders = {seed: folder / name / f"seed{seed}" for seed in row.seeds}
-    if row.base:
-        finish_row(row, folder, folders, executor)
-    elif row.retrained:
-        for seed, own in folders.items():
-            train(row.variant, row.settings_of(seed), own, executor=executor)
-            evaluate_row(row, own, executor)
-    else:
-        first, world = make_world(
-            ROWS[row.world] if row.world else row, folder / (row.world or name), executor
-        )
-        for seed, own in folders.items():
-            search(row, seed, own, first, world, executor)
-    return summarise_row(list(folders.values()))
+    own = Path(folder) / name
+    if is_baseline(name, seeds):
+        drive_baseline(name, own / "seed0", executor)
+        return summary([own / "seed0"])
+    experiment, folder = find_experiment(name, seeds), Path(folder)
+    folders = {seed: own / f"seed{seed}" for seed in experiment.seeds}
+    if not (experiment.base or experiment.retrained):
+        source = experiment.world_model or name
+        first, world = train_world_model(EXPERIMENTS[source], folder / source, executor)
+    for seed, run in folders.items():
+        config = experiment.config_of(seed)
+        if experiment.base:
+            base = folder / experiment.base / run.name
+            if not (base / EVALUATION).exists():
+                replicate(experiment.base, folder, executor, [seed])
+            fine_tune(config, base, run, executor)
+        elif experiment.retrained:
+            train(config, run, executor=executor)
+        else:
+            share_world_model(config, run, world)
+            train(config, run, world / "dataset", executor=executor, earlier=first)
+        evaluate_run(run, executor)
+    return summary(list(folders.values()))
 
 
-def drive_floor(name: str, folder: Path, executor: Executor | None) -> dict:
-    """Drive the official tracks without looking, and write `evaluation.json` and a record."""
-    if not (folder / "evaluation.json").exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        begin, tracks = time.perf_counter(), list(range(TRACKS))
-        with worker_processes(Settings().processes, executor) as executor:
-            driven = run_in_order(
-                executor, drive_blindly, [(name, track) for track in tracks], name
-            )
-        returns, lengths = (np.array(part) for part in zip(*driven, strict=True))
-        told = {"variant": name, "renderer": "none: it does not look"} | report(
-            tracks, returns, lengths
-        )
-        record = {
-            "variant": name,
-            "made_with": provenance(f"python -m stad_lab replicate --row {name} --out ..."),
-        }
-        save_json(folder / "record.json", record | {"budget": {}})
-        save_json(folder / "evaluation.json", told | {"seconds": time.perf_counter() - begin})
-    return summarise_row([folder])
+def summary(folders: list[Path]) -> dict:
+    """The summary of the returns of some runs."""
+    evaluations = [load_evaluation(folder / EVALUATION) for folder in folders]
+    returns = [[episode["return"] for episode in one["episodes"]] for one in evaluations]
+    return {"seeds": len(folders), **summarise(np.array(returns))}
+
+
+def is_baseline(name: str, seeds: Seeds = None) -> bool:
+    """Whether an experiment is a baseline driver; ValueError if that is given seeds."""
+    if name in BASELINE_DRIVERS and seeds:
+        raise ValueError(f"{name!r} is no training and has no seeds: leave them out")
+    return name in BASELINE_DRIVERS
+
+
+def drive_baseline(name: str, folder: Path, executor: Executor | None) -> None:
+    """Drive the tracks of the evaluation blindly; writes the evaluation and a record."""
+    if (folder / EVALUATION).exists():
+        return
+    begin, tracks = time.perf_counter(), list(range(TRACKS))
+    with worker_processes(Config().processes, executor) as executor:
+        tasks = [(name, track) for track in tracks]
+        returns, lengths = zip(*run_in_order(executor, drive_blindly, tasks, name), strict=True)
+    found = {"kind": KIND, "variant": name, "renderer": "none"}
+    found |= report(tracks, np.array(returns), np.array(lengths))
+    made_with = provenance(f"python -m stad_lab replicate --experiment {name} --out ...")
+    record = {"kind": "record", "variant": name, "made_with": made_with, "budget": {}}
+    save_json(folder / RECORD, record)
+    save_json(folder / EVALUATION, found | {"seconds": time.perf_counter() - begin})
+
+
+class ConstantDriver(RandomDriver):
+    """Drives straight on with the gas of the first controller of CMA-ES."""
+
+    def act(self) -> np.ndarray:
+        """The next action, float32 (3,)."""
+        return squash(np.array([0.0, Config().evolution.initial_gas, 0.0])).astype(np.float32)
 
 
 def drive_blindly(name: str, track: int) -> tuple[float, int]:
-    """Drive an official track as a row of FLOORS: (return, frames). Runs in a worker process.
+    """Drive a track as a baseline driver: (return, frames). Runs in a worker process.
 
     Rewards do not depend on the renderer, so the fast one serves.
     """
-    work_alone()
-    driver = RandomDriver(np.random.default_rng([0, track]))
-    gentle = squash(np.array([0.0, Settings().initial_gas, 0.0]))
-    env = make_env(fast=True)
-    env.reset(seed=track)
-    total, frames, ended = 0.0, 0, False
-    while not ended:
-        action = driver.act() if name == "random_driver" else gentle
-        _, reward, terminated, truncated, _ = env.step(action.astype(np.float32))
-        total, frames, ended = total + reward, frames + 1, terminated or truncated
-    env.close()
-    return total, frames
+    single_thread()
+    kind = RandomDriver if name == "random_driver" else ConstantDriver
+    driver, env = kind(random_stream("random driver", 0, track)), make_env(fast=True)
+    episodes = rollout(driver, [env], [env.reset(seed=track)[0]])
+    return float(episodes.returns[0]), int(episodes.lengths[0])
 
 
-def finish_row(row: Row, folder: Path, folders: dict[int, Path], executor: Executor | None) -> None:
-    """Make the finishes of a row, seed -> folder, and those seeds of its base that are not there."""
-    for seed, own in folders.items():
-        base = folder / row.base / own.name
-        if not (base / "evaluation.json").exists():
-            replicate(row.base, folder, executor, [seed])
-        searches = [one.settings_of(seed) for one in (ROWS[row.base], row)]
-        check_same_run(base, load_json(base / "record.json")["settings"], searches[0].as_dict())
-        finish(row.variant, searches[1], base, own, executor)
-        evaluate_row(row, own, executor)
-
-
-def make_world(row: Row, folder: Path, executor: Executor | None) -> tuple[Path | None, Path]:
-    """Make a row's rollouts, V and M, and before them its first round: the folders of both."""
-    first, world = folder / "first" if row.first else None, folder / "world"
-    if row.first:
-        train(row.variant, row.first, first, executor=executor)
-    train(row.variant, row.settings, world, until="mdn_rnn", executor=executor, earlier=first)
+def train_world_model(
+    experiment: Experiment, folder: Path, executor: Executor | None
+) -> tuple[Path | None, Path]:
+    """Make an experiment's dataset, V and M, and before them its first run: both folders."""
+    first, world = folder / "first" if experiment.first else None, folder / "world"
+    if experiment.first:
+        train(experiment.first, first, executor=executor)
+    train(experiment.config, world, until="mdn_rnn", executor=executor, earlier=first)
     return first, world
 
 
-def search(
-    row: Row, seed: int, folder: Path, first: Path | None, world: Path, executor: Executor | None
-) -> None:
-    """Search for C with one seed, and drive what was found on the official tracks.
+def share_world_model(config: Config, run: Path, world: Path) -> None:
+    """Copy V and M into a run, and the components and first C that another seed has computed.
 
-    Where a search begins, and along which components, depends on the world alone: the first seed finds it for all,
-    but for a seed from elsewhere, with V and M of another training.
+    Those depend on V and M alone, so they are taken from seeds that have these V and M.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    trained = ("autoencoder", "mdn_rnn") if row.settings.m_steps else ("autoencoder",)
-    made = [world / f"{part}.safetensors" for part in trained]
-    alike = [
-        seed
-        for seed in seed_folders(folder.parent)
-        if all(same_file(seed / file.name, file) for file in made)
-    ]
-    found = [
-        seed / name for seed in alike for name in (COMPONENTS, START) if (seed / name).exists()
-    ]
-    for source in made + found:
-        if not (folder / source.name).exists():
-            copy_file(source, folder)
-    train(
-        row.variant,
-        row.settings_of(seed),
-        folder,
-        world / "rollouts",
-        executor=executor,
-        earlier=first,
-    )
-    evaluate_row(row, folder, executor)
+    run.mkdir(parents=True, exist_ok=True)
+    trained = (VAE_FILE, MDN_RNN_FILE) if config.mdn_rnn.steps else (VAE_FILE,)
+    for other in [world, *run.parent.glob("seed*")]:
+        if filecmp.cmpfiles(other, world, trained, shallow=False)[0] == list(trained):
+            for name in (*trained, COMPONENTS_FILE, START_FILE):
+                if (other / name).exists() and not (run / name).exists():
+                    copy_file(other / name, run)
 
 
-def same_file(one: Path, other: Path) -> bool:
-    """Whether both files are there and hold the same bytes."""
-    return one.exists() and other.exists() and filecmp.cmp(one, other, shallow=False)
-
-
-def evaluate_row(row: Row, folder: Path, executor: Executor | None) -> None:
-    """Drive what a search found on the official tracks, and write `evaluation.json`, if that does not tell of it."""
-    path, found = folder / "evaluation.json", checksum((folder / CONTROLLER).read_bytes())
-    if (
-        not path.exists()
-        or load_json(path, "run the same command again")["controller_sha256"] != found
-    ):
-        unfinished = folder / "unfinished-evaluation.json"
-        save_json(
-            path, evaluate(row.variant, folder, TRACKS, executor=executor, unfinished=unfinished)
-        )
-        unfinished.unlink(missing_ok=True)
+def evaluate_run(folder: Path, executor: Executor | None) -> None:
+    """Evaluate a run's C with Gymnasium's renderer, unless its evaluation is of this C."""
+    path, (parameters, _) = folder / EVALUATION, load_controller(folder / CONTROLLER_FILE)
+    own = checksum_of_arrays(parameters=parameters)
+    if path.exists() and load_evaluation(path)["controller"] == own:
+        return
+    unfinished = folder / f"unfinished-{EVALUATION}"
+    save_json(path, evaluate(folder, TRACKS, executor=executor, unfinished=unfinished))
+    unfinished.unlink(missing_ok=True)
 
 
 def keep(
-    name: str, folder: str | Path, target: Path = RECORDS, seeds: Sequence[int] | None = None
-) -> list[Path]:
-    """Copy the records of a row's finished seeds to where the notebooks look for them; returns their new folders.
+    name: str,
+    folder: str | Path,
+    seeds: Seeds = None,
+    to: Path = tables.DATA,
+) -> list[str]:
+    """Add the finished seeds of an experiment to the tables; returns their names.
 
-    With them go the records and the losses of the first round and of the world, if the row has its own. Seeds that are
-    made elsewhere, in a folder without seed 0, may have V and M from another training by the same settings. If so, the
-    records of that one go to `first_of_seed1` and `world_of_seed1`, by the first of these seeds; if not, they are there
-    already, or come with seed 0 and replace those.
-
-    Args:
-        seeds: as of `replicate`.
+    With them go its first run and its world model, under the lowest of these seeds.
     """
-    kept = []
-    for seed in (0,) if is_floor(name, seeds) else find_row(name, seeds).seeds:
-        source = Path(folder) / name / f"seed{seed}"
-        if (source / "evaluation.json").exists():
-            kept.append(target / name / source.name)
-            copy_records(source, kept[-1])
-    seed_0 = Path(folder) / name / "seed0"
-    with_seed_0 = bool(kept) and (seed_0 / "evaluation.json").exists()
-    known = worlds(kept) <= worlds(
-        [path for path in seed_folders(target / name) if path not in kept]
-    )
-    for part in ("first", "world"):
-        if (Path(folder) / name / part).exists() and (with_seed_0 or not known):
-            own = part if with_seed_0 else f"{part}_of_{kept[0].name}"
-            copy_records(Path(folder) / name / part, target / name / own)
-            keep_histories(Path(folder) / name / part, target / name / own)
-    if with_seed_0:
-        remove_twins(target / name, seed_0)
+    own, kept = Path(folder) / name, []
+    wanted = [0] if is_baseline(name, seeds) else find_experiment(name, seeds).seeds
+    finished = [seed for seed in wanted if (own / f"seed{seed}" / EVALUATION).exists()]
+    for part, role in (("first", "first_iteration"), ("world", "world_model")):
+        if finished and (own / part / RECORD).exists():
+            tables.add_run(own / part, name, min(finished), to, role)
+    for seed in finished:
+        tables.add_run(own / f"seed{seed}", name, seed, to)
+        kept.append(tables.key(name, seed))
     return kept
 
 
-def remove_twins(row: Path, seed_0: Path) -> None:
-    """Remove the records of a training that was kept under a later seed's name and is that of seed 0, too."""
-    for twin in [*row.glob("first_of_seed*"), *row.glob("world_of_seed*")]:
-        _, seed = twin.name.split("_of_")
-        if worlds([row / seed]) == worlds([seed_0]):
-            shutil.rmtree(twin)
+def describe_time(name: str, seeds: Seeds = None) -> str:
+    """One line on how long an experiment took us, with everything that it builds on."""
+    if is_baseline(name, seeds):
+        hours = recorded_hours(name, 1)
+    else:
+        experiment = find_experiment(name, seeds)
+        hours = recorded_hours(name, len(experiment.seeds))
+        hours += recorded_hours(experiment.base, len(experiment.seeds))
+        hours += recorded_hours(experiment.world_model, 0)
+    return f"{name}: about {60 * hours:.0f} minutes with two processes, if nothing of it is there"
 
 
-def keep_histories(source: Path, target: Path) -> None:
-    """Write how the losses of V and M went, which their weights tell and which stay behind: `histories.json`."""
-    files = {part: source / f"{part}.safetensors" for part in ("autoencoder", "mdn_rnn")}
-    save_json(
-        target / "histories.json",
-        {part: load_tensors(file)[1]["history"] for part, file in files.items()},
-    )
+def recorded_hours(name: str | None, runs: int) -> float:
+    """How long so many runs of an experiment took us, with the training of a shared V and M."""
+    table = tables.read("runs").query("experiment == @name")
+    seconds = table.filter(like="seconds.").sum(axis=1)
+    own = table["role"] == "run"
+    return (seconds[~own].sum() + runs * seconds[own].mean()) / 3600 if own.any() else 0.0
 
 
-def copy_records(source: Path, target: Path) -> None:
-    """Copy a run's records, as far as it has them."""
-    for file in KEPT:
-        if (source / file).exists():
-            copy_file(source / file, target)
-
-
-def time_needed(name: str, seeds: Sequence[int] | None = None) -> dict[str, float]:
-    """How long a row, or some of its seeds, takes on this machine, in seconds: what it is for -> time.
-
-    Measures for about half a minute.
-
-    An agent's episode is taken to have as many frames as it may have at most, so the searches may be quicker.
-    """
-    if is_floor(name, seeds):
-        return {"evaluations": TRACKS * MAX_FRAMES / (Settings().processes * blind_speed(name))}
-    row = find_row(name, seeds)
-    if row.base:
-        times, before = time_needed(row.base, row.seeds), ROWS[row.base].settings
-        longer = most_frames(row.settings) / most_frames(before)
-        return times | {
-            "finishes": times["searches"] * longer,
-            "evaluations": 2 * times["evaluations"],
-        }
-    with tempfile.TemporaryDirectory() as folder:
-        speed = speeds(row, Path(folder))
-    made = ROWS[row.world] if row.world else row
-    rounds = (
-        [made.first, made.settings]
-        if made.first
-        else [made.settings] * (len(row.seeds) if row.retrained else 1)
-    )
-    return {
-        "rollouts": sum(
-            s.episodes * s.episode_frames + s.agent_episodes * s.max_frames for s in rounds
-        )
-        / speed["V, M, C"],
-        "V": sum(s.v_steps * s.v_batch for s in rounds) / speed["V"],
-        "M": sum(s.m_steps * s.m_batch * s.m_sequence for s in rounds) / speed["M"],
-        "first search": most_frames(row.first) / speed["V, M, C"] if row.first else 0.0,
-        "searches": len(row.seeds) * most_frames(row.settings) / speed["V, M, C"],
-        "evaluations": len(row.seeds) * TRACKS * MAX_FRAMES / speed["official"],
-    }
-
-
-def most_frames(settings: Settings) -> int:
-    """How many frames a search for C drives at most, with its looks at the validation tracks."""
-    looks = settings.generations // settings.validate_every * settings.validation_tracks
-    return (
-        settings.generations * settings.population * settings.tracks + looks
-    ) * settings.max_frames
-
-
-def speeds(row: Row, folder: Path) -> dict[str, float]:
-    """What this machine does in a second: frames driven with V, M and C, images of V, frames of M, official frames."""
-    settings, length = row.settings, 60
-    collect_rollouts(Settings.preset("quick"), folder / "rollouts")
-    mdn_rnn = MDNRNN(settings.latent_size, settings.hidden_size, settings.mixtures)
-    autoencoder = AutoEncoder(row.variant, settings.latent_size, settings.width)
-    save_pair(folder, autoencoder, mdn_rnn, settings)
-    brief = dataclasses.replace(settings, max_frames=length)
-    start = initial_parameters(settings.latent_size, settings.hidden_size, settings.initial_gas)
-    with worker_processes(settings.processes) as executor:
-        for _ in range(2):  # the first time workers start
-            begin = time.perf_counter()
-            entry = drive_generation(
-                executor, folder, row.variant, brief, [], np.tile(start, (settings.population, 1))
-            )
-            driven = entry["frames"] / (time.perf_counter() - begin)
-    env = make_env(fast=False)
-    env.reset(seed=0)
-    begin = time.perf_counter()
-    for _ in range(length):
-        env.step(np.array([0.0, 0.1, 0.0], np.float32))
-    official = length / (time.perf_counter() - begin)
-    env.close()
-    return {
-        "V, M, C": driven,
-        "official": settings.processes * official,
-        "V": train_v(False, settings.width, folder / "rollouts", 0, steps=12)[0],
-        "M": train_m(False, 0, steps=6, batch=settings.m_batch // 4),
-    }
-
-
-def blind_speed(name: str) -> float:
-    """Frames a second that a driver of FLOORS drives here."""
-    begin = time.perf_counter()
-    return drive_blindly(name, 0)[1] / (time.perf_counter() - begin)
-
-
-def describe_time(name: str, times: dict[str, float]) -> str:
-    """One line that says how long a row takes."""
-    parts = ", ".join(
-        f"{part} {seconds / 60:.0f} min" for part, seconds in times.items() if seconds
-    )
-    return f"{name}: at most {sum(times.values()) / 3600:.1f} hours on this machine, if nothing of it is there ({parts})"
-
-
-def describe_row(name: str, found: dict) -> str:
-    """One line of the table."""
+def describe(name: str, found: dict) -> str:
+    """One line on an experiment that was run."""
     low, high = found["interval"]
     return (
-        f"{name}: {found['mean']:.1f} +- {found['standard_deviation']:.0f} on {TRACKS} official tracks"
-        f" ({len(found['seeds'])} seeds), 95% interval of the mean {low:.0f} to {high:.0f},"
-        f" {100 * found['above_900']:.0f}% above {SOLVED}, best {TOP} {found['top_90']:.1f};"
-        f" a seed cost {found['agents']:.0f} agents, {found['episodes']:.0f} episodes"
+        f"{name}: {found['mean']:.1f} on {TRACKS} tracks, {found['seeds']} seeds, 95% interval of"
+        f" the mean {low:.0f} to {high:.0f}, {100 * found['above_900']:.0f}% above 900"
     )

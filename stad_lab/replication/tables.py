@@ -1,218 +1,194 @@
-"""The table of the replication: what the records of its rows say, and how sure that is.
+"""The measurements of the replication as tidy tables: one CSV file each, which pandas opens.
 
-The records that we report lie in `stad_lab/records/table`, a folder for each row as `stad_lab.replication.run` has it.
+A run is named by `experiment`, `role` and `seed`. The role is "run" (CMA-ES for C, evaluated),
+"first_iteration" (of a recipe with two) or "world_model" (only V and M); the last two serve the run
+of the same seed and those after it, up to the next. C of each run is in `data/controllers`.
 """
 
-import itertools
-from collections import Counter
+import shutil
 from pathlib import Path
 
 import numpy as np
+import pandas
 
-from stad_lab.evaluation.evaluate import (
-    RESAMPLES,
-    SOLVED,
-    bootstrap,
-    draw_tracks,
-    middle_95,
-    resampled_means,
-    summarise,
-)
-from stad_lab.io.files import load_json
-from stad_lab.replication.experiments import FLOORS, ROWS
-from stad_lab.training.evolution import LOG
+from stad_lab.evaluation.evaluate import load_evaluation
+from stad_lab.io.files import checksum_of_tensors, load_json, load_tensors, write_bytes
+from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
 from stad_lab.training.pipeline import total_budget
 
-RECORDS = Path(__file__).parents[1] / "records" / "table"
-# World Models' own log, in generations of 64 agents with 16 episodes each: episodes -> score.
-WORLD_MODELS = {
-    25 * 64 * 16: 823.0,
-    50 * 64 * 16: 867.0,
-    200 * 64 * 16: 880.0,
-    1800 * 64 * 16: 900.5,
+DATA = Path(__file__).parent / "data"
+TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
+UNITS = ("agents", "episodes", "frames")
+RUN = ["experiment", "role", "seed"]
+TABLES = {  # name -> columns that name a line, and others that each line must have
+    "episodes": (["experiment", "seed", "track"], ["return", "frames"]),
+    "fast_episodes": (["agent", "processor", "track"], ["return", "frames"]),
+    "generations": ([*RUN, "generation"], ["worst", "mean", "best", "sigma", "frames"]),
+    "runs": (RUN, ["variant", "commit"]),
+    "histories": ([*RUN, "network", "step", "data"], ["total"]),
+    "probe": (["world_model", "seed", "driver", "features", "quantity"], ["variant", "r2"]),
+    "model_metrics": (["model", "world_model", "metric", "index"], ["value"]),
+    "speed": (["part", "measure", "condition", "round"], ["value"]),
+    "provenance": (["table", "source"], ["commit"]),
 }
-PAPER = {
-    "frame": 827.0,
-    "input": 905.0,
-    "output": 906.0,
-    "input_output": 902.0,
-}  # its table, on CarRacing-v0
-OTHERS = {  # the rest of that table
-    "Task-aware AE": 200.0,
-    "DQN": 343.0,
-    "DDPG": 100.0,
-    "A3C, continuous": 591.0,
-    "A3C, discrete": 652.0,
-    "OpenAI": 838.0,
-    "World Models": 906.0,
-}
-RECIPES = {  # rows RECIPE_VARIANT, and what the picture of the replication calls them
-    "paper": "the paper's recipe here, v3",
-    "two_rounds": "our recipe, v3",
-    "finished": "ours, finished",
-}
-PAPER_BEST = {"best agent": 929.82, "best generation": 911.73}  # the highest points of its figures
-TOP = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
 
 
-def kept_rows(records: Path = RECORDS) -> dict[str, list[Path]]:
-    """The rows that have been made: name -> folders of its finished seeds, in the order of FLOORS and ROWS."""
-    found = {
-        name: [seed for seed in seed_folders(records / name) if (seed / "evaluation.json").exists()]
-        for name in [*FLOORS, *ROWS]
-    }
-    return {name: folders for name, folders in found.items() if folders}
+def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
+    """Read a table.
 
-
-def seed_folders(row: Path) -> list[Path]:
-    """The folders `seed0`, `seed1` and so on of a row; not a `seed0_old` beside them, which would count twice."""
-    return sorted(path for path in row.glob("seed*") if path.name.removeprefix("seed").isdecimal())
-
-
-def describe_table(rows: dict[str, list[Path]]) -> str:
-    """The table of the replication, in Markdown: a line for each of the rows of `kept_rows`."""
-    lines = [
-        "| row | seeds | V, M | mean of 100 tracks | 95% interval | above 900 | agents | episodes | frames |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, folders in rows.items():
-        found, planned = summarise_row(folders), len(ROWS[name].seeds) if name in ROWS else 1
-        seeds = f"{len(folders)} of {planned}" if len(folders) < planned else f"{len(folders)}"
-        low, high = found["interval"]
-        lines.append(
-            f"| `{name}` | {seeds} | {found['worlds']} | {found['mean']:.1f} | {low:.1f} to {high:.1f}"
-            f" | {found['above_900']:.0%} | {found['agents']:,.0f} | {found['episodes']:,.0f}"
-            f" | {found['frames'] / 1e6:.2f} M |"
-        )
-    return "\n".join(lines)
-
-
-def claims_and_outcomes(
-    rows: dict[str, list[Path]],
-) -> dict[str, dict[str, tuple[float, list[float], list[float]]]]:
-    """What the paper reports of each variant, and what came out here.
-
-    Returns:
-        variant -> "the paper, v0" or a name of RECIPES -> (mean return, its 95% interval, the mean of each search), for
-        the rows that are made. The paper gives neither interval nor searches.
+    Raises:
+        ValueError: a column is missing or has gaps, or a line is there twice.
     """
-    scores = {
-        variant: {"the paper, v0": (claim, [claim, claim], [])} for variant, claim in PAPER.items()
-    }
-    for variant, (recipe, told) in itertools.product(PAPER, RECIPES.items()):
-        if f"{recipe}_{variant}" in rows:
-            returns = official_returns(rows[f"{recipe}_{variant}"])
-            scores[variant][told] = (
-                float(returns.mean()),
-                bootstrap(returns),
-                returns.mean(axis=1).tolist(),
-            )
-    return scores
+    (keys, values), path = TABLES[name], folder / f"{name}.csv"
+    table = pandas.read_csv(path, low_memory=False)  # exact from pandas 3.1 on
+    for column in keys + values:
+        if column not in table or table[column].isna().any():
+            raise ValueError(f"{path}: column {column!r} is missing or has empty cells")
+    if (twice := table.duplicated(keys)).any():
+        raise ValueError(f"{path}: more than one line for {table.loc[twice, keys].values[0]}")
+    return table
 
 
-def stage_times(row: Path) -> dict[str, float]:
-    """How long the stages of a row took, from nothing to the evaluated agent of seed 0, in seconds.
+def episodes(folder: Path = DATA) -> pandas.DataFrame:
+    """The evaluation of each run: `return` and `frames` on every official track.
 
-    Args:
-        row: folder of a row that has a world of its own. The stages of a first round count too.
-
-    Returns:
-        "rollouts", "autoencoder", "mdn_rnn", "controller" and "evaluation" -> seconds.
+    Raises:
+        ValueError: as `read`, or an evaluation that is not on the tracks 0 to 99.
     """
-    times: Counter[str] = Counter()
-    for part in ("first", "world", "seed0") if (row / "first").exists() else ("world", "seed0"):
-        times.update(load_json(row / part / "record.json")["seconds"])
-    return dict(times) | {"evaluation": load_json(row / "seed0" / "evaluation.json")["seconds"]}
+    table = read("episodes", folder)
+    for (experiment, seed), run in table.groupby(["experiment", "seed"]):
+        check_tracks(f"{experiment}, seed {seed}", run["track"])
+    return table
 
 
-def lost_points(folders: list[Path]) -> dict[str, float]:
-    """Where the points up to 1,000 went, mean of all episodes: 1,000 less the sum of the parts is the mean return.
+def check_tracks(name: str, tracks) -> None:
+    """Raise ValueError unless an evaluation drives every official track once."""
+    if sorted(tracks) != list(range(TRACKS)):
+        raise ValueError(f"{name}: expected one episode on each of the tracks 0 to {TRACKS - 1}")
 
-    Returns:
-        "speed": 0.1 for each frame of a lap, had every episode been a complete lap at the mean time of those that were.
-        "waiting": 0.1 for each frame more. A lap ends when all tiles are visited, so that one missed tile prolongs the
-        episode to its last frame; only leaving the field shortens it. "tiles": those not visited, and the 100 points
-        for leaving the field.
+
+def returns_of(table: pandas.DataFrame, column: str = "return") -> dict[str, np.ndarray]:
+    """Experiment -> its returns, or another column of `episodes`: (seeds, tracks)."""
+    wide = table.pivot(index=["experiment", "seed"], columns="track", values=column)
+    return {name: wide.loc[name].to_numpy() for name in table["experiment"].unique()}
+
+
+def fitness(run: str, folder: Path = DATA) -> dict[str, np.ndarray]:
+    """All returns of a CMA-ES run (named as by `key`), the seeds of its tracks, and validations.
+
+    Shapes: (generations, agents, tracks), (generations, tracks) and (validations, tracks).
     """
-    episodes = [
-        episode
-        for folder in folders
-        for episode in load_json(folder / "evaluation.json")["episodes"]
-    ]
-    returns, frames = (
-        np.array([episode[name] for episode in episodes]) for name in ("return", "frames")
-    )
-    laps = frames[
-        returns >= SOLVED
-    ]  # 1,000 frames at most, so 900 points at least; and with a tile missing, fewer
-    speed = laps.mean() if len(laps) else frames.mean()
-    return {
-        "speed": float(0.1 * speed),
-        "waiting": float(0.1 * (frames.mean() - speed)),
-        "tiles": float((1000 - returns - 0.1 * frames).mean()),
-    }
+    with np.load(folder / "fitness.npz") as file:
+        return {part: file[f"{run}/{part}"] for part in ("returns", "tracks", "validation")}
 
 
-def learning_curve(folder: Path) -> tuple[np.ndarray, np.ndarray]:
-    """The scores on the validation tracks of one seed, and how many episodes had been driven for each: two (looks,).
+def key(experiment: str, seed: int, role: str = "run") -> str:
+    """The name of a run in file names, for example "paper_frame-0"."""
+    return f"{experiment}-{seed}" + f"-{role}" * (role != "run")
 
-    All episodes count: the random driver's, those of a first round and of its agent, and the validation itself.
+
+def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str = "run") -> None:
+    """Add the records of a finished run to the tables, in place of those that it has there.
+
+    Raises:
+        ValueError: a damaged file, or an evaluation of another variant, renderer, controller or
+            of other tracks.
     """
-    log, record = load_json(folder / LOG)["generations"], load_json(folder / "record.json")
-    own = sum(record["budget"][part]["episodes"] for part in ("evolution", "validation"))
-    driven, episodes, scores = total_budget(record)["episodes"] - own, [], []
-    for entry in log:
-        driven += sum(len(returns) for returns in entry["returns"])
-        if "validation" in entry:
-            driven += len(entry["validation"]["returns"])
-            episodes.append(driven)
-            scores.append(entry["validation"]["mean"])
-    return np.array(episodes), np.array(scores)
+    run = dict(zip(RUN, (experiment, role, seed), strict=True))
+    line = run | describe_record(load_json(folder / "record.json"))
+    if (file := folder / "controller.safetensors").exists():
+        line["controller"] = checksum_of_tensors(load_tensors(file)[0])
+    if (path := folder / "evaluation.json").exists():  # checked before anything is written
+        evaluation = load_evaluation(path)
+        check_evaluation(path, evaluation, experiment, line.get("controller"))
+        line["seconds.evaluation"] = evaluation["seconds"]
+        driven = pandas.DataFrame(evaluation["episodes"])
+        replace_lines("episodes", driven.assign(experiment=experiment, seed=seed), to)
+    if (path := folder / "evolution.json").exists():
+        log = load_json(path)
+        line |= {"vae": log["vae"], "mdn_rnn": log["mdn_rnn"]} | flatten(log["best"], "best.")
+        add_log(run, log["generations"], to)
+    for network in ("vae", "mdn_rnn"):
+        if (path := folder / f"{network}.safetensors").exists() and role != "run":
+            metadata = load_tensors(path)[1]
+            line[network] = metadata["weights"]
+            add_history(run | {"network": network}, metadata["history"], to)
+    if file.exists():
+        copies = to / "controllers"
+        copies.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(file, copies / f"{key(**run)}.safetensors")
+    replace_lines("runs", pandas.DataFrame([line]), to)
 
 
-def summarise_row(folders: list[Path]) -> dict:
-    """What the table shows of a row, from the folders of its seeds.
-
-    Returns:
-        "mean", "standard_deviation" (over all episodes), "interval" (95%, of the mean, over seeds and tracks), "seeds"
-        (the mean of each), "worlds" (how many trainings of V and M are behind them), "above_900" (share of episodes),
-        "top_90" (mean of each seed's best 90 episodes), and the budget of one seed: "agents", "episodes", "frames"
-        (means over the seeds), with all that was driven before it.
-    """
-    returns = official_returns(folders)
-    budgets = [total_budget(load_json(folder / "record.json")) for folder in folders]
-    return {
-        **summarise(returns),
-        "seeds": returns.mean(axis=1).tolist(),
-        "worlds": len(worlds(folders)),
-        "top_90": float(np.sort(returns, axis=1)[:, -TOP:].mean()),
-        **{
-            unit: float(np.mean([spent[unit] for spent in budgets]))
-            for unit in ("agents", "episodes", "frames")
-        },
-    }
+def check_evaluation(path: Path, found: dict, experiment: str, controller: str | None) -> None:
+    """Raise ValueError unless an evaluation is the official one of this experiment's agent."""
+    wanted = {"variant": experiment}  # a driver without V sees no picture, of whatever renderer
+    if experiment not in BASELINE_DRIVERS:
+        variant = EXPERIMENTS[experiment].config.variant
+        wanted = {"variant": variant, "renderer": "gymnasium", "controller": controller}
+    for name, value in wanted.items():
+        if found[name] != value:
+            raise ValueError(f"{path}: {name} is {found[name]!r}, expected {value!r}")
+    check_tracks(str(path), [episode["track"] for episode in found["episodes"]])
 
 
-def worlds(folders: list[Path]) -> set[tuple[str, str]]:
-    """The identities of the V's and M's that the searches in some folders had; none of a driver of FLOORS."""
-    logs = [load_json(folder / LOG) for folder in folders if (folder / LOG).exists()]
-    return {(log["autoencoder"], log["mdn_rnn"]) for log in logs}
+def describe_record(record: dict) -> dict:
+    """The line of `runs` for a record: settings, machine, times and budget, with dotted names."""
+    line = flatten({"config": record.get("config", {})}) | record["made_with"]
+    line |= {"variant": record["variant"], "config.variant": None}
+    line["continued_with"] = " ".join(one["commit"] for one in record.get("continued_with", []))
+    line |= flatten({name: record.get(name, {}) for name in ("seconds", "budget")})
+    line |= flatten(total_budget(record), "total.")
+    return {name: value for name, value in line.items() if value is not None}
 
 
-def official_returns(folders: list[Path]) -> np.ndarray:
-    """The returns of a row's seeds on the official tracks, float64 (seeds, tracks), from their folders."""
-    evaluations = [load_json(folder / "evaluation.json", "evaluate again") for folder in folders]
-    return np.array([[episode["return"] for episode in found["episodes"]] for found in evaluations])
+def add_log(run: dict, log: list[dict], to: Path) -> None:
+    """Add the generations of a CMA-ES run to `generations` and to the file of all returns."""
+    lines = pandas.DataFrame([run | flatten(entry) for entry in log])
+    fitness = [np.mean(returns, axis=1) for returns in lines["returns"]]
+    for name, statistic in (("worst", np.min), ("mean", np.mean), ("best", np.max)):
+        lines[name] = [statistic(values) for values in fitness]
+    arrays = ["returns", "tracks", "validation.returns"]
+    replace_lines("generations", lines.drop(columns=arrays), to)
+    path = to / "fitness.npz"
+    kept = dict(np.load(path)) if path.exists() else {}
+    for name in arrays:
+        kept[f"{key(**run)}/{name.split('.')[0]}"] = np.array(lines[name].dropna().tolist())
+    np.savez_compressed(path, **{name: kept[name] for name in sorted(kept)})
 
 
-def bootstrap_gain(
-    before: np.ndarray, after: np.ndarray, resamples: int = RESAMPLES
-) -> list[float]:
-    """95% interval of the mean of `after` less the mean of `before`, both returns (seeds, tracks) on the same tracks.
+def add_history(network: dict, history: list[dict], to: Path) -> None:
+    """Add the losses of a network's training to `histories`."""
+    both = [(entry, data) for entry in history for data in ("train", "heldout")]
+    lines = [network | {"step": one["step"], "data": data} | one[data] for one, data in both]
+    replace_lines("histories", pandas.DataFrame(lines), to)
 
-    Seeds are drawn anew for each of the two, tracks once for both: a long track costs both of them time. Of a row with
-    one seed the luck of its search is left out, so that the interval is too narrow.
-    """
-    rng, tracks = draw_tracks(before, resamples)
-    gains = resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks)
-    return middle_95(gains)
+
+def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
+    """Write a table with new lines in the place of those of the same run (and network)."""
+    run = [column for column in (*RUN, "network") if column in lines]
+    if (folder / f"{name}.csv").exists():
+        old = read(name, folder)
+        new = pandas.MultiIndex.from_frame(lines[run])
+        lines = pandas.concat([old[~pandas.MultiIndex.from_frame(old[run]).isin(new)], lines])
+    save(name, lines, folder)
+
+
+def save(name: str, table: pandas.DataFrame, folder: Path = DATA) -> None:
+    """Write a table in the order of its keys: floats with all digits, whole numbers without."""
+    keys = TABLES[name][0]
+    table = table[keys + [column for column in table if column not in keys]].sort_values(keys)
+    for column in table.select_dtypes("float"):  # gaps make floats of whole numbers
+        if (table[column].dropna() % 1 == 0).all():
+            table[column] = table[column].astype("Int64")
+    text = table.to_csv(index=False, lineterminator="\n")
+    write_bytes(folder / f"{name}.csv", text.encode())
+
+
+def flatten(values: dict, prefix: str = "") -> dict:
+    """{"a": {"b": 1}} -> {"a.b": 1}."""
+    found = {}
+    for name, value in values.items():
+        nested = isinstance(value, dict)
+        found |= flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return found

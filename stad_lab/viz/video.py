@@ -1,35 +1,98 @@
-"""Films of an agent driving: what the car shows, what changes, what V makes of it and what it dreams, side by side."""
+"""Animations: pictures or figures that move, and an agent at the wheel beside its dreams."""
+
+import io
+from collections.abc import Iterable
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent
-from stad_lab.envs.dream import dream_on
-from stad_lab.envs.frames import earlier_frames
+from stad_lab.dreaming import dream_on
+from stad_lab.envs.frames import earlier_frames, to_pictures
 from stad_lab.evaluation.trajectories import (
-    FRAMES_A_SECOND,
-    Drive,
-    Inside,
-    look_inside,
-    record_drive,
+    Inspection,
+    Trajectory,
+    inspect_trajectory,
+    record_trajectory,
 )
-from stad_lab.models.vae import to_array, to_pictures, to_uint8
-from stad_lab.viz.plots import (
-    check_kind,
-    difference_colors,
-    moving_figure,
-    moving_picture,
-    plot_moment,
-)
+from stad_lab.models.vae import to_tensor, to_uint8
+from stad_lab.viz.plots import difference_colors, plot_moment, to_png
 
-EVERY = 3  # of so many frames one is shown; a film runs at the real speed
-NAP = 100  # frames of a dream, two seconds: long enough to see it leave the drive, short enough to compare
+FPS = 50  # frames a second of CarRacing's physics
+EVERY = 3  # one of so many frames is shown, at the real speed
+DREAM = 100  # frames of an open-loop dream: two seconds
+
+
+def animate_pictures(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
+    """An animated GIF of pictures side by side.
+
+    Args:
+        columns: title -> pictures, uint8 (frames, H, W, 3), square; all of one length.
+        fps: pictures per second.
+
+    Raises:
+        ValueError: no pictures, or columns of different lengths.
+    """
+    lengths = {title: len(pictures) for title, pictures in columns.items()}
+    if len(set(lengths.values())) != 1 or 0 in lengths.values():
+        raise ValueError(f"columns of lengths {lengths}: expected one length, at least one picture")
+    size, header, gap = 192, 20, 6  # pixels
+    font, pages = ImageFont.load_default(13), []
+    for pictures in zip(*columns.values(), strict=True):
+        page = Image.new("RGB", (len(columns) * (size + gap) - gap, size + header), "white")
+        draw = ImageDraw.Draw(page)
+        for left, title, picture in zip(range(0, 10**6, size + gap), columns, pictures):  # noqa: B905
+            draw.text((left + size / 2, header / 2), title, fill="black", font=font, anchor="mm")
+            page.paste(enlarged(picture, size), (left, header))
+        pages.append(page)
+    # One palette for all pages, or colours would flicker; "maximum coverage" keeps rare ones, for
+    # example the car's red.
+    sample = np.concatenate([np.asarray(page) for page in pages[:: max(1, len(pages) // 8)]])
+    palette = Image.fromarray(sample).quantize(256, Image.Quantize.MAXCOVERAGE)
+    pages = [page.quantize(palette=palette, dither=Image.Dither.NONE) for page in pages]
+    return save_pages(pages, fps, "gif")
+
+
+def animate_figures(figures: Iterable[Figure], fps: float, kind: str = "gif") -> bytes:
+    """Figures of one size as an animation.
+
+    Args:
+        kind: "gif", or "webp", which is sharper and smaller.
+
+    Raises:
+        ValueError: another kind, or no figures.
+    """
+    check_kind(kind)
+    pages = [Image.open(io.BytesIO(to_png(figure))).convert("RGB") for figure in figures]
+    if not pages:
+        raise ValueError("no figures: expected at least one")
+    return save_pages(pages, fps, kind)
+
+
+def save_pages(pages: list[Image.Image], fps: float, kind: str) -> bytes:
+    """Pages as an endless animation."""
+    buffer, pause = io.BytesIO(), round(1000 / fps)  # milliseconds
+    pages[0].save(buffer, kind, save_all=True, append_images=pages[1:], duration=pause, loop=0)
+    return buffer.getvalue()
+
+
+def enlarged(picture: np.ndarray, size: int) -> Image.Image:
+    """A square picture, uint8 (H, W, 3), with `size` pixels on each side."""
+    return Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST)
+
+
+def check_kind(kind: str) -> None:
+    """Raise ValueError unless `animate_figures` can write this kind of file."""
+    if kind not in ("gif", "webp"):
+        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp', by the file's name too")
 
 
 @torch.no_grad()
 def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
-    """An animated GIF of observation, difference image, reconstruction and dream while the agent drives.
+    """An animated GIF of observation, difference image, reconstruction and dream.
 
     Args:
         track: seed of the track.
@@ -39,69 +102,70 @@ def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
     Raises:
         ValueError: the episode ends before `first`, or a number that is out of range.
     """
-    drive = record_longer_drive(agent, track, first, frames)
-    film = drive.frames(agent.crop_bar)
-    earlier = earlier_frames(film, agent.stride)
-    shown = slice(first, None, EVERY)
-    frame, difference = to_pictures(film[shown], earlier[shown])
+    trajectory, world_model = record_longer(agent, track, first, frames), agent.world_model
+    seen, shown = trajectory.frames(world_model.crop_bar), slice(first, None, EVERY)
+    earlier = earlier_frames(seen, world_model.stride)
+    frame, difference = to_pictures(seen[shown], earlier[shown])
+    reconstruction, _ = agent.vae.reconstruct(to_tensor(frame), to_tensor(difference))
     columns = {
-        "what the car shows": drive.observations[shown],
-        "what changes": difference_colors(to_array(difference)),
-        "what V makes of it": to_uint8(agent.autoencoder.reconstruct(frame, difference)[0]),
-        "what it dreams": naps(agent, drive, first)[::EVERY],
+        "observation": trajectory.observations[shown],
+        "difference image": difference_colors(difference),
+        "V's reconstruction": to_uint8(reconstruction),
+        "dream": repeated_dreams(agent, trajectory, first)[::EVERY],
     }
-    return moving_picture(columns, fps=FRAMES_A_SECOND / EVERY)
+    return animate_pictures(columns, fps=FPS / EVERY)
 
 
-def naps(agent: Agent, drive: Drive, first: int, length: int = NAP) -> np.ndarray:
-    """The dreams of an agent that falls asleep at frame `first` of its own drive, and is woken every `length` frames.
+def repeated_dreams(
+    agent: Agent, trajectory: Trajectory, first: int, length: int = DREAM
+) -> np.ndarray:
+    """Dreams of `length` frames, each from where its own trajectory then is.
 
     Returns:
-        One picture for each frame from `first` on, uint8 (len(drive) - first, 64, 64, 3). While it sleeps, the agent
-        drives in the dream, and every dream begins with what M expects to see next.
+        A picture for each frame from `first` on, uint8 (len(trajectory) - first, 64, 64, 3).
     """
     agent.reset()
     dreams = []
-    for moment, observation in enumerate(drive.observations):
-        agent.act(
-            observation
-        )  # as it did in the drive: this gives the agent its memory of that moment back
+    for moment, observation in enumerate(trajectory.observations):
+        agent.act(observation)  # as in the episode, so that M has its memory of that moment
         if moment >= first and (moment - first) % length == 0:
-            dreams.append(dream_on(agent, min(length, len(drive) - moment), seed=len(dreams))[0])
+            frames = min(length, len(trajectory) - moment)
+            dreams.append(dream_on(agent, frames, seed=len(dreams))[0])
     return np.concatenate(dreams)
 
 
 def film_viewer(agent: Agent, track: int, first: int, frames: int, kind: str = "gif") -> bytes:
-    """The rollout viewer while the agent drives, as an animation; arguments as for `film_agent`.
+    """The trajectory viewer of an agent's episode, as an animation.
 
     Args:
-        kind: "gif" or "webp".
+        kind: "gif" or "webp"; the others as for `film_agent`.
 
     Raises:
         ValueError: as `film_agent`, or another kind.
     """
     check_kind(kind)
-    drive = record_longer_drive(agent, track, first, frames)
-    inside = look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
-    return film_inside(drive, inside, first, kind)
-
-
-def film_inside(drive: Drive, inside: Inside, first: int = 0, kind: str = "gif") -> bytes:
-    """The rollout viewer as an animation, "gif" or "webp": one moment in EVERY, at the real speed."""
-    moments = tqdm(range(first, len(drive), EVERY), "film", unit="picture")
-    return moving_figure(
-        (plot_moment(drive, inside, moment) for moment in moments), FRAMES_A_SECOND / EVERY, kind
+    trajectory = record_longer(agent, track, first, frames)
+    return film_trajectory(
+        trajectory, inspect_trajectory(agent.world_model, trajectory), first, kind
     )
 
 
-def record_longer_drive(agent: Agent, track: int, first: int, frames: int) -> Drive:
-    """Record a drive of at most `first + frames` frames; raises as `film_agent`, before the drive where it can."""
+def film_trajectory(
+    trajectory: Trajectory, inspection: Inspection, first: int = 0, kind: str = "gif"
+) -> bytes:
+    """The trajectory viewer as an animation, one moment in EVERY, at the real speed."""
+    moments = tqdm(range(first, len(trajectory), EVERY), "film", unit="picture")
+    figures = (plot_moment(trajectory, inspection, moment) for moment in moments)
+    return animate_figures(figures, FPS / EVERY, kind)
+
+
+def record_longer(agent: Agent, track: int, first: int, frames: int) -> Trajectory:
+    """An episode of at most `first + frames` frames; raises as `film_agent`."""
     for name, value, least in (("track", track, 0), ("first", first, 0), ("frames", frames, 1)):
         if value < least:
             raise ValueError(f"{name}={value}: expected at least {least}")
-    drive = record_drive(agent, track, first + frames)
-    if len(drive) <= first:
-        raise ValueError(
-            f"first={first}, but on track {track} the episode ends after {len(drive)} frames"
-        )
-    return drive
+    trajectory = record_trajectory(agent, track, first + frames)
+    if len(trajectory) <= first:
+        ends = f"on track {track} the episode ends after {len(trajectory)} frames"
+        raise ValueError(f"first={first}, but {ends}")
+    return trajectory

@@ -1,7 +1,9 @@
-"""The fast environment is Gymnasium's CarRacing-v3: the same numbers to the last bit, the same picture to the eye."""
+"""The fast environment equals Gymnasium's CarRacing-v3: bit for bit, and nearly in its pictures."""
 
 import copy
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ STRAIGHT = np.array([0, 1, 0], np.float32)
 
 
 def follow_road(env, speed=45):
-    """Steer to a tile ahead, looking at the track itself."""
+    """Steer to a tile ahead, from the true track."""
     car, track = env.unwrapped.car, env.unwrapped.track
     tiles = np.array([tile[2:4] for tile in track])
     nearest = np.argmin(((tiles - car.hull.position) ** 2).sum(axis=1))
@@ -42,9 +44,9 @@ def wild(env):
 
 
 def drive_both(driver, seed, frames=MAX_FRAMES, pictures=True):
-    """Drive the fast environment, repeat its actions in Gymnasium's: two lists of what `step` returned.
+    """Repeat a drive in Gymnasium's environment: two lists of what `step` returned.
 
-    Without pictures Gymnasium's renderer is left out, which is 98% of its time; its physics stay as they are.
+    Without pictures Gymnasium's renderer is left out, which is 98% of its time.
     """
     steps = []
     fast, official = make_env(fast=True), make_env(fast=False)
@@ -69,7 +71,7 @@ def long_drive():
     return drive_both(follow_road, 26, 400)
 
 
-def assert_equal_to_the_last_bit(fast, official):
+def assert_bit_identical(fast, official):
     """Rewards, terminations, truncations and infos."""
     assert [step[1:] for step in fast] == [step[1:] for step in official]
 
@@ -83,47 +85,47 @@ def differences(fast, official, rows=slice(None)):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_rewards_equal_to_the_last_bit_on_the_road(seed):
+def test_rewards_bit_identical_on_the_road(seed):
     fast, official = drive_both(follow_road, seed, 120, pictures=False)
     assert sum(step[1] for step in fast) > 40  # it was on the road
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
 
 
 @pytest.mark.parametrize("seed", [3, 4, 5])
-def test_rewards_equal_to_the_last_bit_off_the_road(seed):
+def test_rewards_bit_identical_off_the_road(seed):
     fast, official = drive_both(wild, seed, 120, pictures=False)
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
 
 
-def test_rewards_equal_to_the_last_bit_in_a_long_episode_of_unmodified_gymnasium(long_drive):
+def test_rewards_bit_identical_in_a_long_episode_of_unmodified_gymnasium(long_drive):
     fast, official = long_drive
     assert len(fast) == 400
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
 
 
 @pytest.mark.parametrize("seed", [6, 11])
-def test_rewards_equal_to_the_last_bit_off_the_field(seed):
+def test_rewards_bit_identical_off_the_field(seed):
     fast, official = drive_both(leave_field, seed, pictures=False)
     assert fast[-1][1:4] == (-100, True, False)
     assert fast[-1][4] == {"lap_finished": False}
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
 
 
 @pytest.mark.parametrize("driver", [follow_road, wild])
-def test_rewards_equal_to_the_last_bit_to_the_frame_limit(driver):
+def test_rewards_bit_identical_to_the_frame_limit(driver):
     fast, official = drive_both(driver, 1, pictures=False)
     assert len(fast) == MAX_FRAMES
     assert fast[-1][2:4] == (False, True)
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
 
 
-def test_rewards_equal_to_the_last_bit_to_the_end_of_a_lap():
+def test_rewards_bit_identical_to_the_end_of_a_lap():
     fast, official = drive_both(lambda env: follow_road(env, speed=60), 1, pictures=False)
     assert fast[-1][4] == {"lap_finished": True}
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
 
 
-def test_pictures_of_20_episodes_are_gymnasium_s_to_half_a_level_and_around_the_car_to_four():
+def test_pictures_of_20_episodes_differ_by_half_a_level_and_around_the_car_by_four():
     episodes = [compare_pictures(number, frames=20) for number in range(20)]
     assert all(equal for _, equal in episodes)
     whole, window, bar = np.concatenate([errors for errors, _ in episodes]).mean(axis=0)
@@ -141,7 +143,7 @@ def test_pictures_differ_by_less_than_one_level_in_the_opening_zoom(long_drive):
 @pytest.mark.parametrize("where", ["on the road", "off the road"])
 def test_pictures_differ_by_less_than_one_level_on_average_on_and_off_the_road(where, long_drive):
     fast, official = long_drive if where == "on the road" else drive_both(wild, 23, 160)
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
     fast, official = [step[0] for step in fast], [step[0] for step in official]
     assert np.mean(differences(fast, official)) <= 1
     assert max(differences(fast, official)) <= 1.5
@@ -152,7 +154,7 @@ def test_pictures_differ_by_less_than_one_level_on_average_on_and_off_the_road(w
 def test_pictures_differ_by_less_than_one_level_near_the_edge_of_the_field():
     fast, official = drive_both(leave_field, 16)
     assert fast[-1][1:4] == (-100, True, False)
-    assert_equal_to_the_last_bit(fast, official)
+    assert_bit_identical(fast, official)
     fast, official = [step[0] for step in fast[-60:]], [step[0] for step in official[-60:]]
     assert max(differences(fast, official)) <= 1
 
@@ -226,7 +228,7 @@ def test_without_the_bar_only_the_bar_is_missing():
         assert not without[BAR_TOP:].any()
 
 
-def test_an_observation_belongs_to_whoever_got_it():
+def test_an_observation_may_be_changed_by_its_receiver():
     env, other = make_env(), make_env()
     env.reset(seed=30)
     other.reset(seed=30)
@@ -247,9 +249,9 @@ def test_a_closed_environment_holds_no_track_and_can_be_reset_again():
 
 
 def test_a_copy_is_made_with_the_same_arguments():
-    twin = copy.deepcopy(make_env(bar=False, domain_randomize=True).unwrapped)
-    assert twin.domain_randomize
-    assert not twin.reset(seed=0)[0][BAR_TOP:].any()
+    other = copy.deepcopy(make_env(bar=False, domain_randomize=True).unwrapped)
+    assert other.domain_randomize
+    assert not other.reset(seed=0)[0][BAR_TOP:].any()
 
 
 def test_two_environments_do_not_paint_over_each_other():
@@ -323,3 +325,38 @@ def test_an_action_that_is_not_finite_is_refused():
         ValueError, match=r"action \[.*nan.*\]: expected finite numbers, steering, gas and brake"
     ):
         env.step(np.array([0, np.nan, 0]))
+
+
+def in_a_fresh_process(code):
+    """What a new Python prints."""
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    return process.stdout.strip()
+
+
+def test_gymnasium_makes_the_fast_environment_by_its_name_in_a_fresh_process():
+    code = """
+import gymnasium
+env = gymnasium.make("stad_lab:StadLab/CarRacing-v3", bar=False)
+print(env.reset(seed=1)[0].shape, env.spec.max_episode_steps, type(env.unwrapped).__name__)
+"""
+    assert in_a_fresh_process(code) == "(96, 96, 3) 1000 FastCarRacing"
+
+
+def test_the_controller_loads_neither_torch_nor_pygame():
+    code = """
+import sys
+import stad_lab.models.controller
+print([name for name in ("torch", "pygame", "Box2D", "cv2", "filelock") if name in sys.modules])
+"""
+    assert in_a_fresh_process(code) == "[]"
+
+
+def test_stad_lab_can_be_imported_without_a_working_gymnasium():
+    code = """
+import sys
+sys.modules["gymnasium"] = None
+import stad_lab
+print(stad_lab.Config.preset("quick").seed)
+"""
+    assert in_a_fresh_process(code) == "0"

@@ -1,25 +1,29 @@
-"""The dream is a Gymnasium environment that repeats itself for a seed and shows pictures."""
+"""The dream: a Gymnasium environment, repeatable for a seed, in which an agent drives."""
 
+import subprocess
+import sys
 import warnings
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 
-from stad_lab.agent import Agent
-from stad_lab.envs.dream import DreamEnv, dream_on
-from stad_lab.evaluation.trajectories import record_drive
+from stad_lab.agent import PRETRAINED, Agent
+from stad_lab.dreaming import dream_on, make_dream
+from stad_lab.envs.dream import DreamEnv
+from stad_lab.evaluation.trajectories import record_trajectory
 from stad_lab.models.controller import control
-from stad_lab.viz.video import naps
+from stad_lab.viz.video import repeated_dreams
 
 ACTION = np.array([0.1, 0.5, 0], np.float32)
 
 
 @pytest.fixture
 def dream(agent):
-    """A dream of the quick run."""
-    return DreamEnv(agent.autoencoder, agent.mdn_rnn, max_frames=20, render_mode="rgb_array")
+    """A short dream with pictures."""
+    return DreamEnv(agent.vae, agent.mdn_rnn, max_frames=20, render_mode="rgb_array")
 
 
 def dream_along(env, seed, frames=10, **options):
@@ -36,17 +40,17 @@ def test_check_env_passes(dream):
 
 
 def test_the_same_seed_gives_the_same_dream_and_another_seed_another_one(dream):
-    start = {"latents": np.zeros(32, np.float32)}  # so that the seed alone tells them apart
+    start = {"latents": np.zeros(32, np.float32)}  # so that they differ in the seed alone
     first, other = (dream_along(dream, seed=seed, **start) for seed in (1, 2))
     assert np.array_equal(dream_along(dream, seed=1, **start), first)
     assert not np.isclose(other[1:], first[1:]).all(axis=1).any()
     assert np.isfinite(first).all()
     assert not np.isclose(
         dream.reset(seed=1)[0], dream.reset(seed=2)[0]
-    ).all()  # nor do they begin alike
+    ).all()  # the first z differs, too
 
 
-def test_the_action_steers_the_dream(dream):
+def test_the_action_changes_the_dream(dream):
     straight = dream_along(dream, seed=1)
     dream.reset(seed=1)
     turned = [dream.step(np.array([-1, 0, 1], np.float32))[0] for _ in range(10)]
@@ -68,7 +72,7 @@ def test_a_dream_is_cut_after_max_frames_and_never_rewarded(dream):
     assert [step[1:4] for step in steps] == [(0.0, False, False)] * 19 + [(0.0, False, True)]
 
 
-def test_a_dream_shows_pictures_of_its_latents(dream):
+def test_a_dream_renders_what_v_decodes_from_its_latents(dream):
     dream.reset(seed=0, options={"latents": np.zeros(32, np.float32)})
     first = dream.render()
     assert first.shape == (64, 64, 3)
@@ -81,7 +85,7 @@ def test_a_dream_shows_pictures_of_its_latents(dream):
     assert dream.render() is None
 
 
-def test_a_dream_shows_the_memory_of_m(dream, agent):
+def test_the_info_of_a_dream_holds_m_s_memory(dream, agent):
     _, info = dream.reset(seed=0)
     assert info["hidden"].shape == (agent.mdn_rnn.hidden_size,)
     assert not info["hidden"].any()
@@ -91,9 +95,7 @@ def test_a_dream_shows_the_memory_of_m(dream, agent):
 @pytest.mark.parametrize("action", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]]])
 def test_an_action_that_is_not_three_finite_numbers_is_refused(action, dream):
     dream.reset(seed=0)
-    with pytest.raises(
-        ValueError, match=r"action \[.*\]: expected three finite numbers, steering, gas and brake"
-    ):
+    with pytest.raises(ValueError, match=r"action \[.*\]: expected finite steering, gas and brake"):
         dream.step(np.array(action, np.float32))
 
 
@@ -113,22 +115,20 @@ def test_latents_that_do_not_fit_are_refused(dream):
 def test_a_memory_that_does_not_fit_is_refused(cars, value, dream):
     state = (torch.full((1, cars, dream.mdn_rnn.hidden_size), value),) * 2
     with pytest.raises(
-        ValueError, match=rf"a memory of shape \(1, {cars}, .*: expected \(1, 1, .*, M's h and c"
+        ValueError, match=rf"memory of shape \(1, {cars}, .*: expected \(1, 1, .*, h and c"
     ):
         dream.reset(options={"state": state})
 
 
-@pytest.mark.parametrize("temperature", [0, -1, 1e-40, float("nan")])
+@pytest.mark.parametrize("temperature", [0, -1, float("nan"), float("inf")])
 def test_a_temperature_that_is_no_positive_number_is_refused(temperature, agent):
     with pytest.raises(ValueError, match=f"temperature={temperature}: expected a .*number above 0"):
-        DreamEnv(agent.autoencoder, agent.mdn_rnn, temperature)
+        DreamEnv(agent.vae, agent.mdn_rnn, temperature)
 
 
 def test_another_render_mode_is_refused(agent):
-    with pytest.raises(
-        ValueError, match="render_mode='human': a dream can be rendered as 'rgb_array' only"
-    ):
-        DreamEnv(agent.autoencoder, agent.mdn_rnn, render_mode="human")
+    with pytest.raises(ValueError, match="render_mode='human': expected 'rgb_array' or None"):
+        DreamEnv(agent.vae, agent.mdn_rnn, render_mode="human")
 
 
 def test_a_step_before_reset_is_refused(dream):
@@ -138,10 +138,10 @@ def test_a_step_before_reset_is_refused(dream):
 
 def test_a_picture_before_reset_is_refused(agent):
     with pytest.raises(RuntimeError, match="render before reset: call reset"):
-        DreamEnv(agent.autoencoder, agent.mdn_rnn, render_mode="rgb_array").render()
+        DreamEnv(agent.vae, agent.mdn_rnn, render_mode="rgb_array").render()
 
 
-def test_an_agent_dreams_on_without_being_changed(agent, observations):
+def test_an_agent_is_not_changed_by_its_dream(agent, observations):
     for observation in observations[:10]:
         agent.act(observation)
     before = [part.clone() for part in agent.state], agent.latents.copy()
@@ -160,7 +160,7 @@ def test_an_agent_dreams_on_without_being_changed(agent, observations):
 
 
 @torch.no_grad()
-def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent, observations):
+def test_a_cold_dream_continues_an_episode_step_by_step_with_m_s_memory(agent, observations):
     for observation in observations[:10]:
         agent.act(observation)
     pictures, actions = dream_on(agent, 4, temperature=1e-6)
@@ -169,12 +169,12 @@ def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent,
         pictures, actions, strict=True
     ):  # by hand, with the likeliest z of every step
         z = mixture.mean.gather(-1, mixture.logpi.argmax(-1, keepdim=True))[0, 0, :, 0]
-        drawn = agent.autoencoder.decode(z[None])[0][0].permute(1, 2, 0).numpy()
-        assert np.abs(drawn - picture / 255).max() < 0.02
+        decoded = agent.vae.decode(z[None])[0][0].permute(1, 2, 0).numpy()
+        assert np.abs(decoded - picture / 255).max() < 0.02
         seen = np.concatenate([z.numpy(), state[0][0, 0].numpy()])
         assert control(agent.parameters, seen[None])[0] == pytest.approx(action, abs=1e-2)
         mixture, state = agent.mdn_rnn(z[None, None], torch.from_numpy(action)[None, None], state)
-    dream = DreamEnv(agent.autoencoder, agent.mdn_rnn, 1e-6)
+    dream = DreamEnv(agent.vae, agent.mdn_rnn, 1e-6)
     latents, _ = dream.reset(options={"latents": z.numpy(), "state": state})
     for _ in range(3):
         latents, _, _, _, info = dream.step(action)
@@ -183,24 +183,22 @@ def test_a_cold_dream_goes_on_from_the_drive_step_by_step_with_m_s_memory(agent,
         assert info["hidden"] == pytest.approx(state[0][0, 0].numpy(), abs=1e-5)
 
 
-def test_an_agent_in_a_film_dreams_on_from_its_own_drive_and_is_woken_in_time(agent):
-    drive = record_drive(agent, track=np.int64(3), frames=25)
-    dreams = naps(agent, drive, first=6, length=8)
-    assert dreams.shape == (len(drive) - 6, 64, 64, 3)
-    for nap, moment in enumerate((6, 14, 22)):
+def test_dreams_in_a_film_restart_from_the_trajectory_every_length_frames(agent):
+    trajectory = record_trajectory(agent, track=np.int64(3), frames=25)
+    dreams = repeated_dreams(agent, trajectory, first=6, length=8)
+    assert dreams.shape == (len(trajectory) - 6, 64, 64, 3)
+    for number, moment in enumerate((6, 14, 22)):
         agent.reset()
-        for observation in drive.observations[: moment + 1]:
+        for observation in trajectory.observations[: moment + 1]:
             action = agent.act(observation)
-        assert np.array_equal(action, drive.actions[moment])
-        length = min(8, len(drive) - moment)
-        dream, _ = dream_on(agent, length, seed=nap)
+        assert np.array_equal(action, trajectory.actions[moment])
+        length = min(8, len(trajectory) - moment)
+        dream, _ = dream_on(agent, length, seed=number)
         assert np.array_equal(dreams[moment - 6 :][:length], dream)
 
 
-def test_an_agent_that_has_seen_nothing_cannot_dream_on(agent):
-    with pytest.raises(
-        ValueError, match="has not acted yet: let it drive a few real frames, then dream on"
-    ):
+def test_an_agent_that_has_not_acted_cannot_dream(agent):
+    with pytest.raises(ValueError, match="has not acted yet: let it drive some real frames first"):
         dream_on(agent, 5)
 
 
@@ -211,17 +209,34 @@ def test_a_dream_of_no_frame_is_refused(agent, observations):
         dream_on(agent, 0)
 
 
-def test_one_car_dreams_on_with_its_own_c_and_several_cannot(agent, observations):
+def test_one_car_dreams_with_its_own_c_and_several_cannot(agent, observations):
     rows = np.stack([agent.parameters, -agent.parameters])
-    many, alone = (
-        Agent(agent.autoencoder, agent.mdn_rnn, c, agent.stride, agent.crop_bar)
-        for c in (rows, rows[1])
-    )
+    many, alone = (Agent(agent.world_model, c) for c in (rows, rows[1]))
     many.act_batch(observations[:2])
-    with pytest.raises(ValueError, match=r"drives 2 cars: expected one, so go on with agent\.keep"):
+    with pytest.raises(ValueError, match=r"drives 2 cars, expected one: use agent\.keep"):
         dream_on(many, 5)
     many.keep(np.array([1]))
     alone.act(observations[1])
     assert np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-4)
     alone.parameters = rows[0]
     assert not np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-2)
+
+
+def test_gymnasium_makes_the_dream_of_an_agent_by_its_name_in_a_fresh_process():
+    code = """
+import gymnasium, numpy as np
+env = gymnasium.make("stad_lab:StadLab/Dream-v0", source="frame", render_mode="rgb_array")
+env.reset(seed=0)
+env.step(np.zeros(3, np.float32))
+print(env.render().shape, env.unwrapped.vae.variant)
+"""
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.stdout == "(64, 64, 3) frame\n", process.stderr
+
+
+def test_a_dream_is_made_of_a_name_or_a_folder():
+    env = gym.make("StadLab/Dream-v0", source=PRETRAINED / "input", max_frames=3)
+    assert env.unwrapped.vae.variant == "input" and env.unwrapped.max_frames == 3
+    assert make_dream("output").vae.variant == "output"
+    with pytest.raises(FileNotFoundError):
+        make_dream("no_such_run")

@@ -1,4 +1,7 @@
-"""The seat without a browser: keys, buttons and the loop do what they say."""
+"""The driving widget without a browser: buttons, held pedals and the loop.
+
+How keys reach it is tested in test_keys_in_browser.py.
+"""
 
 import threading
 import time
@@ -7,7 +10,7 @@ import pytest
 
 from stad_lab import load_agent
 from stad_lab.play.session import Session
-from stad_lab.play.widget import FRAME_LISTENING, Loop, Seat
+from stad_lab.play.widget import Loop, Seat
 
 
 @pytest.fixture
@@ -32,11 +35,6 @@ def wait_for(fact):
         time.sleep(0.01)
 
 
-def key(kind, code, **more):
-    """An event as ipyevents sends it."""
-    return {"type": kind, "code": code, **more}
-
-
 def loops():
     """How many cars drive in this process."""
     return sum(
@@ -44,51 +42,65 @@ def loops():
     )
 
 
-def test_keys_go_down_and_come_up_and_all_come_up_when_the_pointer_leaves(make_seat):
+def test_the_pedals_that_the_page_sends_are_held_and_others_are_refused(make_seat):
     seat = make_seat()
-    seat.on_event({"type": "mouseenter"})
-    assert seat.picture.layout.border_top == FRAME_LISTENING
-    seat.on_event(key("keydown", "KeyW"))
-    seat.on_event(key("keydown", "ArrowLeft"))
+    seat.wire.value = "gas left"
     assert seat.session.hand.held == {"gas", "left"}
-    seat.on_event(key("keyup", "KeyW"))
+    seat.wire.value = "left"
     assert seat.session.hand.held == {"left"}
-    seat.on_event({"type": "mouseleave"})
-    assert seat.session.hand.held == set() and seat.picture.layout.border_top != FRAME_LISTENING
+    seat.wire.value = ""
+    assert seat.session.hand.held == set()
+    with pytest.raises(ValueError, match="pedal 'clutch'"):
+        seat.wire.value = "clutch"
 
 
-def test_the_loop_drives_and_pauses_with_keys_held_and_says_who_drives(make_seat):
+def test_the_game_has_the_keys_from_drive_to_pause_and_keeps_them_when_an_episode_ends(make_seat):
+    seat = make_seat()
+
+    def has_keys():
+        return "stad-lab-driving" in seat.view._dom_classes
+
+    assert not has_keys()
+    seat.go.value = True
+    assert has_keys()
+    seat.go.value = False
+    assert not has_keys()
+    seat = make_seat()
+    step = seat.session.env.step
+    seat.session.env.step = lambda action: (*step(action)[:2], True, False, {})
+    seat.go.value = True
+    wait_for(lambda: not seat.go.value)
+    assert has_keys()  # a key that is still held must not become a command of JupyterLab
+
+
+def test_the_loop_drives_and_pauses_with_pedals_held_and_says_who_drives(make_seat):
     seat = make_seat()
     before = seat.picture.value
-    seat.on_event(key("keydown", "KeyP"))
-    seat.on_event(key("keydown", "KeyP", repeat=True))  # a held key is pressed once
-    seat.on_event(key("keydown", "ArrowUp"))
-    wait_for(lambda: len(seat.session.rows) > 5)
+    seat.go.value, seat.wire.value = True, "gas"
+    wait_for(lambda: len(seat.session.rows) > 5 and "keys held: gas" in seat.status.value)
     assert seat.picture.value != before and "You drive on track 3" in seat.status.value
-    seat.on_event(key("keydown", "KeyP"))
+    seat.go.value = False
     wait_for(lambda: not loops() and "paused" in seat.status.value)
     driven = len(seat.session.rows)
-    seat.on_event(key("keyup", "ArrowUp"))
+    seat.wire.value = ""
     time.sleep(0.1)
     assert len(seat.session.rows) == driven and seat.session.hand.held == set()
-    for _ in range(9):  # pause and drive on at once, while the old loop is still in a step
+    for _ in range(9):  # pause and continue at once, while the old loop is still in a step
         seat.go.value = not seat.go.value
     driven = len(seat.session.rows)
     wait_for(lambda: len(seat.session.rows) > driven + 3)
     assert seat.go.value and loops() == 1
-    seat.on_event(key("keydown", "KeyT"))
-    assert (
-        seat.session.driver == seat.driver.value == "agent"
-        and "The agent drives" in seat.status.value
-    )
+    seat.swap.click()
+    assert seat.session.driver == seat.driver.value == "agent"
+    assert "The agent drives" in seat.status.value
 
 
-def test_the_key_changes_drivers_after_another_cell_has_given_the_wheel(make_seat):
+def test_the_drivers_change_after_another_cell_has_changed_them(make_seat):
     seat = make_seat()
     seat.session.give("agent")
-    seat.on_event(key("keydown", "KeyT"))
+    seat.swap.click()
     assert seat.session.driver == seat.driver.value == "hand"
-    seat.on_event(key("keydown", "KeyT"))
+    seat.swap.click()
     assert seat.session.driver == seat.driver.value == "agent"
 
 
@@ -107,7 +119,7 @@ def test_worlds_change_while_the_agent_drives_and_the_temperature_reaches_the_dr
     assert seat.go.value and seat.error == "" and seat.session.earlier[-1][0] == 3
 
 
-def test_a_second_seat_stops_the_first_and_the_last_that_starts_drives(make_seat):
+def test_a_second_seat_stops_the_first_and_the_last_to_start_drives(make_seat):
     first = make_seat()
     first.go.value = True
     wait_for(lambda: first.session.rows)

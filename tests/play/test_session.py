@@ -1,11 +1,12 @@
-"""A session at the wheel: smooth keys, a seat for two, two worlds, and a recording that is a Drive."""
+"""A session: smoothed keys, two drivers, two worlds, and a recording that is a Trajectory."""
 
 import numpy as np
 import pytest
 import torch
 
 from stad_lab import load_agent
-from stad_lab.evaluation.trajectories import driven_path, record_drive, remember_drive
+from stad_lab.agent import remember_episode
+from stad_lab.evaluation.trajectories import driven_path, record_trajectory
 from stad_lab.play.session import Hand, Session
 
 
@@ -35,29 +36,29 @@ def test_a_held_key_moves_the_action_smoothly_and_a_released_one_lets_it_fall_ba
     assert hand.act()[0] == 0
 
 
-def test_a_session_that_the_agent_drives_is_the_drive_that_the_agent_drives_alone(session):
+def test_an_agent_drives_in_a_session_exactly_as_alone(session):
     session.give("agent")
     drive(session, ("", 40))
-    alone = record_drive(load_agent("input"), track=3, frames=40)
+    alone = record_trajectory(load_agent("input"), track=3, frames=40)
     for name in ("observations", "actions", "rewards", "motion"):
-        assert np.array_equal(getattr(session.drive(), name), getattr(alone, name))
+        assert np.array_equal(getattr(session.trajectory(), name), getattr(alone, name))
     assert not session.by_hand().any() and session.score == pytest.approx(alone.rewards.sum())
 
 
-def test_the_memory_is_told_what_the_hand_did(session):
+def test_m_remembers_the_actions_of_the_human(session):
     seen = []
     for _ in range(30):
         seen.append(session.agent.latents[0])
         drive(session, ("gas", 1))
     assert session.by_hand().all()
-    done = np.concatenate([session.drive().actions, np.zeros((1, 3), np.float32)])
-    hidden = remember_drive(
+    done = np.concatenate([session.trajectory().actions, np.zeros((1, 3), np.float32)])
+    hidden = remember_episode(
         session.agent.mdn_rnn, np.array([*seen, session.agent.latents[0]]), done
     )
     assert np.allclose(session.before[0][0, 0], hidden[-1], atol=1e-5)
 
 
-def test_the_dream_begins_with_the_frame_in_sight_and_the_real_car_waits_for_the_dreamer(session):
+def test_a_dream_begins_with_the_present_frame_and_the_real_car_waits(session):
     session.give("agent")
     drive(session, ("", 20))
     before, score = session.observation, session.score
@@ -66,30 +67,30 @@ def test_the_dream_begins_with_the_frame_in_sight_and_the_real_car_waits_for_the
     drive(session, ("", 15))
     session.give("hand")
     drive(session, ("brake", 5))
-    dreamt = session.dreamt()
-    assert np.array_equal(dreamt.latents[0], session.agent.latents[0])
+    dream = session.dream_trajectory()
+    assert np.array_equal(dream.latents[0], session.agent.latents[0])
     assert (
-        dreamt.frames.shape == (20, 64, 64, 3)
-        and dreamt.by_hand.tolist() == [False] * 15 + [True] * 5
+        dream.frames.shape == (20, 64, 64, 3)
+        and dream.by_hand.tolist() == [False] * 15 + [True] * 5
     )
     assert session.picture().shape == (64, 64, 3) and session.score == score
     session.enter("real")
-    assert np.array_equal(session.picture(), before) and len(session.drive()) == 20
+    assert np.array_equal(session.picture(), before) and len(session.trajectory()) == 20
     drive(session, ("", 1))
-    assert len(session.drive()) == 21
+    assert len(session.trajectory()) == 21
 
 
-def test_a_hand_takes_over_from_the_agents_last_action_without_a_jerk(session):
+def test_the_human_takes_over_smoothly_from_the_agents_last_action(session):
     session.give("agent")
     drive(session, ("", 25))
     session.give("hand")
     drive(session, ("left", 3))
-    actions = session.drive().actions[24:]
+    actions = session.trajectory().actions[24:]
     assert np.abs(np.diff(actions, axis=0))[:, :2].max() < 0.17
     assert session.by_hand().tolist() == [False] * 25 + [True] * 3
 
 
-def test_an_ended_episode_must_be_begun_anew_and_the_earlier_ones_are_kept(session):
+def test_an_ended_episode_cannot_go_on_and_earlier_episodes_are_kept(session):
     drive(session, ("gas", 5))
     session.begin(np.int64(4))
     drive(session, ("", 7))
@@ -112,10 +113,10 @@ def test_what_does_not_exist_is_refused(session):
         session.enter("mars")
     with pytest.raises(ValueError, match="pedal 'clutch'"):
         session.hand.hold("gas", "clutch")
-    with pytest.raises(ValueError, match="at least one frame"):
-        session.drive()
+    with pytest.raises(ValueError, match="at least one frame first"):
+        session.trajectory()
     with pytest.raises(ValueError, match="nothing was driven in a dream"):
-        session.dreamt()
+        session.dream_trajectory()
 
 
 def test_dead_reckoning_follows_the_car(session):
@@ -126,22 +127,24 @@ def test_dead_reckoning_follows_the_car(session):
     moved = np.array(hull.position) - start
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     assert np.linalg.norm(
-        driven_path(session.drive().motion)[-1] - turn @ moved
+        driven_path(session.trajectory().motion)[-1] - turn @ moved
     ) < 0.1 * np.linalg.norm(moved)
 
 
-def test_a_dream_begins_with_m_s_memory_from_before_the_frame_in_sight(session):
+def test_a_dream_begins_with_m_s_memory_from_before_the_present_frame(session):
     session.give("agent")
     drive(session, ("", 12))
     session.enter("dream")
-    assert session.hidden.any() and np.array_equal(session.hidden, session.agent.hidden[0])
+    assert session.dream.hidden.any()
+    assert np.array_equal(session.dream.hidden, session.agent.hidden[0])
     session.step()
     done, seen = (
-        torch.from_numpy(part)[None] for part in (session.dreamt().actions, session.agent.latents)
+        torch.from_numpy(part)[None]
+        for part in (session.dream_trajectory().actions, session.agent.latents)
     )
     with torch.no_grad():
         after, _ = session.agent.mdn_rnn.remember(seen, done, session.before)
-    assert np.allclose(session.hidden, after[0, 0], atol=1e-5)
+    assert np.allclose(session.dream.hidden, after[0, 0], atol=1e-5)
 
 
 def test_a_second_episode_is_driven_as_if_it_were_the_first(session):
@@ -150,5 +153,6 @@ def test_a_second_episode_is_driven_as_if_it_were_the_first(session):
     session.begin(4)
     drive(session, ("", 10))
     assert np.array_equal(
-        session.drive().actions, record_drive(load_agent("input"), track=4, frames=10).actions
+        session.trajectory().actions,
+        record_trajectory(load_agent("input"), track=4, frames=10).actions,
     )

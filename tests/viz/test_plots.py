@@ -1,4 +1,4 @@
-"""Figures: what they show is in their alternative texts, and no colour has to tell alone."""
+"""Figures: their alternative texts hold their values, and lines differ in more than colour."""
 
 import itertools
 
@@ -7,18 +7,22 @@ import numpy as np
 from stad_lab.envs.car_racing import TRACK_WIDTH
 from stad_lab.viz.plots import (
     STYLES,
+    difference_colors,
     plot_bars,
     plot_claims,
     plot_curves,
+    plot_histograms,
+    plot_history,
     plot_intervals,
     plot_mixture,
+    plot_pictures,
     plot_road,
-    plot_shares,
+    plot_scatter,
     plot_stacks,
 )
 
 
-def test_what_the_first_variant_lacks_is_drawn_for_the_others():
+def test_a_condition_that_the_first_variant_lacks_is_drawn_for_the_others():
     paper, ours = (827.0, [827.0, 827.0], []), (637.0, [600.0, 670.0], [637.0])
     figure = plot_claims(
         {"frame": {"the paper": paper}, "input": {"the paper": paper, "ours": ours}}
@@ -27,7 +31,7 @@ def test_what_the_first_variant_lacks_is_drawn_for_the_others():
     assert any(637.0 in line.get_xdata() for line in figure.axes[0].lines)
 
 
-def test_the_alternative_text_of_a_figure_tells_its_values():
+def test_the_alternative_text_of_a_figure_holds_its_values():
     found = {
         "speed": {
             "frame": {"z": (0.12, [0.1, 0.2]), "z, h": (0.98, [0.9, 1.0])},
@@ -42,17 +46,19 @@ def test_the_alternative_text_of_a_figure_tells_its_values():
         == "T. Lines: one from 3 to 1.5, two from 0 to 0."
     )
     assert "one from 9 to 1.5" in plot_bars(curves, "T", "x", "y").get_label()
-    assert "one 0.5 to 1.5" in plot_shares({"one": np.array([0.25, 0.75])}, "T", "x").get_label()
+    assert (
+        "one 0.5 to 1.5" in plot_histograms({"one": np.array([0.25, 0.75])}, "T", "x").get_label()
+    )
 
 
-def test_lines_beside_each_other_differ_in_colour_and_in_their_dashes():
+def test_neighbouring_lines_differ_in_colour_and_in_dashes():
     assert len(set(STYLES)) == len(STYLES) == 24
     assert all(
         one[0] != other[0] and one[1] != other[1] for one, other in itertools.pairwise(STYLES[:6])
     )
 
 
-def test_the_density_of_a_mixture_holds_one_and_widens_with_the_temperature():
+def test_the_density_of_a_mixture_integrates_to_one_and_widens_with_the_temperature():
     figure = plot_mixture(np.log([0.7, 0.3]), np.array([-1.0, 2.0]), np.log([0.5, 1.0]), [1.0, 4.0])
     widths = []
     for line in figure.axes[0].lines:
@@ -62,7 +68,7 @@ def test_the_density_of_a_mixture_holds_one_and_widens_with_the_temperature():
         widths.append(np.trapezoid((z - middle) ** 2 * density, z))
     weights = (
         np.array([0.7, 0.3]) ** 0.25 / (np.array([0.7, 0.3]) ** 0.25).sum()
-    )  # as sample_mixture has it
+    )  # as Mixture.sample has it
     spread = weights @ np.array([-1.0, 2.0]) ** 2 - (weights @ np.array([-1.0, 2.0])) ** 2
     assert np.allclose(
         widths, [0.7 * 0.25 + 0.3 + 9 * 0.21, weights @ [1.0, 4.0] + spread], rtol=0.02
@@ -75,7 +81,7 @@ def test_every_part_of_a_stack_is_drawn():
     assert [bar.get_x() + bar.get_width() for bar in bars] == [1, 2, 3, 4, 2, 4, 6, 8]
 
 
-def test_a_road_is_as_wide_as_it_is_and_is_shown_around_its_tile():
+def test_a_road_has_its_true_width_and_is_enlarged_around_its_tile():
     angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
     road = 100 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     figure = plot_road(
@@ -89,3 +95,33 @@ def test_a_road_is_as_wide_as_it_is_and_is_shown_around_its_tile():
         [figure.axes[1].get_xlim(), figure.axes[1].get_ylim()], [[-30, 30], [70, 130]]
     )
     assert "200 tiles" in figure.get_label() and "one, two" in figure.get_label()
+
+
+def test_a_history_is_drawn_as_two_losses_over_the_steps():
+    history = [
+        {"step": step, "train": {"total": 9.0 / step}, "heldout": {"total": 10.0 / step}}
+        for step in (1, 2, 4)
+    ]
+    figure = plot_history(history, "V", "nats")
+    assert figure.get_label() == "V. Lines: train from 9 to 2.25, held-out from 10 to 2.5."
+    assert figure.axes[0].lines[1].get_xdata().tolist() == [1, 2, 4]
+
+
+def test_only_the_named_panels_of_a_scatter_are_coloured_by_values():
+    points = (np.arange(5.0), np.arange(5.0))
+    panels = {"yaw rate": points, "samples": points}
+    figure = plot_scatter(panels, "T", "x", "y", {"yaw rate": np.arange(5.0)})
+    plain, bar = figure.axes[1], figure.axes[2]
+    assert plain.collections[0].get_array() is None
+    assert bar.get_ylabel() == "radians per second, to the left"
+    assert figure.get_label() == "T. Panels: yaw rate (5 points), samples (5 points)."
+
+
+def test_difference_images_share_one_scale_centred_at_zero():
+    frame = np.zeros((4, 4, 3), np.uint8)
+    weak, strong = np.full((4, 4, 3), 0.1, np.float32), np.full((4, 4, 3), -0.5, np.float32)
+    figure = plot_pictures([[frame, weak], [None, strong]], ["x", "d"], ["a", "b"], "T")
+    scales = [axis.images[0].norm for axis in (figure.axes[1], figure.axes[3])]
+    assert scales[0] is scales[1] and (scales[0].vmin, scales[0].vmax) == (-0.5, 0.5)
+    nothing = difference_colors(np.zeros((1, 3)))
+    assert np.abs(nothing.astype(int) - nothing[0, 0]).max() <= 1  # a grey or white

@@ -1,5 +1,6 @@
-"""Widgets without a browser: a moved slider draws another picture, and soon."""
+"""Widgets without a browser: a moved slider shows another picture, without delay."""
 
+import io
 import re
 import time
 
@@ -7,10 +8,19 @@ import numpy as np
 import pytest
 from ipywidgets import HTML, FloatSlider
 from matplotlib.figure import Figure
+from PIL import Image
 
-from stad_lab.evaluation.trajectories import look_inside, record_drive
-from stad_lab.viz.plots import moving_figure, plot_moment
-from stad_lab.viz.widgets import explore_latents, show, show_film, view_drive
+from stad_lab.evaluation.trajectories import inspect_trajectory, record_trajectory
+from stad_lab.viz.plots import plot_moment
+from stad_lab.viz.video import animate_figures, animate_pictures, film_agent, film_viewer
+from stad_lab.viz.widgets import (
+    explore,
+    explore_latents,
+    show,
+    show_animation,
+    slider,
+    view_trajectory,
+)
 
 
 def find(widget, kind):
@@ -21,14 +31,14 @@ def find(widget, kind):
 
 
 @pytest.fixture
-def inside(agent):
-    """A short drive and what V and M make of it."""
-    drive = record_drive(agent, track=4, frames=9)
-    return drive, look_inside(agent.autoencoder, agent.mdn_rnn, drive, agent.stride, agent.crop_bar)
+def inspected(agent):
+    """A short trajectory and its inspection."""
+    trajectory = record_trajectory(agent, track=4, frames=9)
+    return trajectory, inspect_trajectory(agent.world_model, trajectory)
 
 
-def test_the_latent_explorer_has_a_slider_for_each_latent_and_redraws_in_less_than_100_ms(agent):
-    explorer = explore_latents(agent.autoencoder, np.zeros(32, np.float32))
+def test_the_latent_explorer_has_a_slider_for_each_latent_and_decodes_in_less_than_100_ms(agent):
+    explorer = explore_latents(agent.vae, np.zeros(32, np.float32))
     sliders, pictures = find(explorer, FloatSlider), find(explorer, HTML)
     assert len(sliders) == 32 and len(pictures) == 2
     seconds = []
@@ -44,28 +54,30 @@ def test_the_latent_explorer_has_a_slider_for_each_latent_and_redraws_in_less_th
 def test_the_latent_explorer_begins_at_its_z_even_far_out(agent):
     z = np.linspace(-6.3, 5.2, 32, dtype=np.float32)
     assert [
-        slider.value for slider in find(explore_latents(agent.autoencoder, z), FloatSlider)
+        slider.value for slider in find(explore_latents(agent.vae, z), FloatSlider)
     ] == pytest.approx(z.tolist(), abs=0.006)
 
 
-def test_the_viewer_shows_another_picture_for_another_moment(inside):
-    viewer = view_drive(*inside)
+def test_the_viewer_shows_another_picture_for_another_moment(inspected):
+    viewer = view_trajectory(*inspected)
     control, picture = viewer.children
     before = picture.value
     control.value = 8
     assert picture.value != before and "Frame 8 of 9" in picture.value
 
 
-def test_what_cannot_be_shown_is_refused(inside):
+def test_what_cannot_be_shown_is_refused(inspected):
     with pytest.raises(ValueError, match="moment=9: expected 0 to 8"):
-        plot_moment(*inside, 9)
+        plot_moment(*inspected, 9)
     with pytest.raises(ValueError, match="kind='mp4': expected 'gif' or 'webp'"):
-        moving_figure([], 10, "mp4")
+        animate_figures([], 10, "mp4")
     with pytest.raises(ValueError, match="no figures"):
-        moving_figure([], 10)
+        animate_figures([], 10)
+    with pytest.raises(ValueError, match="expected one length"):
+        animate_pictures({"a": np.zeros((2, 8, 8, 3), np.uint8), "b": np.zeros((1, 8, 8, 3))})
 
 
-def test_figures_are_shown_one_below_the_other_each_with_its_own_words():
+def test_every_figure_is_shown_with_its_own_alternative_text():
     figures = [Figure(figsize=(1, 1), label=words) for words in ("a slow lap", "a fast lap")]
     assert re.findall('alt="(.*?)"', show(*figures).data) == ["a slow lap", "a fast lap"]
 
@@ -74,4 +86,28 @@ def test_a_picture_without_alternative_text_is_refused():
     with pytest.raises(ValueError, match="alt=''"):
         show(Figure(figsize=(1, 1)))
     with pytest.raises(ValueError, match="alt=' '"):
-        show_film(b"GIF", " ")
+        show_animation(b"GIF", " ")
+
+
+def test_explore_draws_again_with_the_values_of_all_controls():
+    def draw(a, b):
+        return Figure(figsize=(1, 1), label=f"a is {a}, b is {b}")
+
+    box = explore(draw, a=slider(0, 9, 4, "a"), b=slider(0.0, 1.0, 0.5, "b"))
+    assert "a is 4, b is 0.5" in box.children[-1].value
+    box.children[0].value = 7
+    assert "a is 7, b is 0.5" in box.children[-1].value
+
+
+def pages(content):
+    """The number of pictures of an animation, and their size."""
+    image = Image.open(io.BytesIO(content))
+    return image.n_frames, image.size
+
+
+def test_a_film_shows_one_frame_of_three(agent):
+    count, (width, height) = pages(film_agent(agent, track=4, first=5, frames=10))
+    assert count == 4 and width == 4 * 192 + 3 * 6 and height == 192 + 20
+    assert pages(film_viewer(agent, track=4, first=2, frames=5, kind="webp"))[0] == 2
+    with pytest.raises(ValueError, match="frames=0: expected at least 1"):
+        film_agent(agent, 4, 0, 0)

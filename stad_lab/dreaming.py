@@ -1,0 +1,78 @@
+"""C drives in a dream: from nothing (`make_dream`), or from where an agent is (`dream_on`)."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from stad_lab.agent import Agent, rollout, run_folder
+from stad_lab.envs.dream import DreamEnv
+from stad_lab.io.weights import load_world_model
+from stad_lab.models.controller import control
+
+
+def make_dream(source: str | Path = "frame", **options) -> DreamEnv:
+    """The dream of an agent; `gymnasium.make("stad_lab:StadLab/Dream-v0")` calls this.
+
+    Args:
+        source: name of a shipped agent, or the folder of a run with V and M.
+        **options: as for `DreamEnv`, for example `temperature=0.5`.
+    """
+    world_model = load_world_model(run_folder(source))
+    return DreamEnv(world_model.vae, world_model.mdn_rnn, **options)
+
+
+class Dreamer:
+    """C at the wheel of one dream: a driver for `agent.rollout`."""
+
+    def __init__(self, env: DreamEnv, parameters: np.ndarray):
+        self.env, self.parameters = env, parameters
+
+    def reset(self) -> None:
+        """Nothing: the memory is the dream's."""
+
+    def act_batch(self, observations: Sequence[np.ndarray]) -> np.ndarray:
+        """C's action for z and the dream's h: float32 (1, 3)."""
+        return control(self.parameters, np.concatenate([observations[0], self.env.hidden])[None])
+
+    def keep(self, cars: np.ndarray) -> None:
+        """Nothing: there is one car."""
+
+
+def dream_on(
+    agent: Agent, frames: int, temperature: float = 1.0, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Continue an agent's episode in the dream: from here on C sees what M predicts.
+
+    The first z is sampled from M's prediction after the agent's last action. The agent is not
+    changed.
+
+    Args:
+        agent: has acted since its last reset, and drives one car.
+
+    Returns:
+        The dreamed frames, uint8 (frames, 64, 64, 3), and the actions, float32 (frames, 3).
+
+    Raises:
+        ValueError: another agent, or fewer than one frame.
+    """
+    if agent.state is None:
+        raise ValueError("the agent has not acted yet: let it drive some real frames first")
+    if len(agent.cars) != 1:
+        raise ValueError(
+            f"the agent drives {len(agent.cars)} cars, expected one: use agent.keep(np.array([0]))"
+        )
+    with torch.no_grad():
+        prediction = agent.mdn_rnn.mixture(agent.state[0].transpose(0, 1))
+        latents = prediction.sample(temperature, torch.Generator().manual_seed(seed))[0, 0]
+    env = DreamEnv(agent.vae, agent.mdn_rnn, temperature, frames, render_mode="rgb_array")
+    first, _ = env.reset(seed=seed, options={"latents": latents.numpy(), "state": agent.state})
+    pictures, actions = [], []
+
+    def record(car: int, env: DreamEnv, observation: np.ndarray, action: np.ndarray) -> None:
+        pictures.append(env.render())
+        actions.append(action)
+
+    rollout(Dreamer(env, agent.present_parameters()), [env], [first], frames, observe=record)
+    return np.array(pictures), np.array(actions)

@@ -1,0 +1,190 @@
+"""Every statistic that a page shows, computed from the tables and written to one file.
+
+`python -m stad_lab claims` renews `data/claims.json` after a run was added; pages and figures take
+their numbers from there. Scores are returns of CarRacing; intervals are [low, high], of 95%.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas
+
+from stad_lab.agent import PRETRAINED
+from stad_lab.config import VARIANTS
+from stad_lab.evaluation import statistics
+from stad_lab.io.files import load_json, write_bytes
+from stad_lab.replication import measurements, tables
+from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS, RECIPES
+from stad_lab.training.pipeline import total_budget
+
+CLAIMS = tables.DATA / "claims.json"
+PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # on CarRacing-v0
+PAPER_OTHERS = {  # the rest of the paper's table
+    "Task-aware AE": 200.0, "DQN": 343.0, "DDPG": 100.0, "A3C, continuous": 591.0,
+    "A3C, discrete": 652.0, "OpenAI": 838.0, "World Models": 906.0,
+}  # fmt: skip
+PAPER_BEST = {"agent": 929.82, "generation": 911.73}  # the highest points of its figures
+WORLD_MODELS = {25600: 823.0, 51200: 867.0, 204800: 880.0, 1843200: 900.5}  # episodes -> score
+COMPARED = ("paper", "two_iterations", "fine_tuned", "no_bar")  # recipes with several runs
+BASELINE_PASSES = 780  # points of `frame` from which a recipe can test the claim
+BEST = 90  # the paper also quotes the mean of the best 90 of its 100 episodes
+
+
+def compute_claims() -> dict[str, dict]:
+    """All statistics as plain numbers: section -> name -> statistics."""
+    episodes, runs, generations = tables.episodes(), tables.read("runs"), tables.read("generations")
+    probe, returns = tables.read("probe"), tables.returns_of(episodes)
+    made = [name for name in (*BASELINE_DRIVERS, *EXPERIMENTS) if name in returns]
+    trained = [name for name in made if name in set(runs.query("role == 'world_model'").experiment)]
+    recipes = {name: compare_recipe(returns, name) for name in COMPARED}
+    yaw_rate = measurements.yaw_rate_of_z(probe)
+    return {
+        "verdict": find_verdict(recipes, float(episodes["return"].max()), yaw_rate),
+        "paper": {"table": PAPER, "others": PAPER_OTHERS, "best": PAPER_BEST},
+        "world_models": {f"{count}_episodes": score for count, score in WORLD_MODELS.items()},
+        "agents": describe_agents(),
+        "recipes": recipes,
+        "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
+        "final_sigma": final_sigma(generations),
+        "fast_renderer": measurements.describe_fast(tables.read("fast_episodes")),
+        "yaw_rate_of_z": yaw_rate,
+        "probe": measurements.describe_probe(probe),
+        "models": measurements.describe_models(tables.read("model_metrics")),
+        "stage_minutes": {name: measurements.stage_minutes(runs, name) for name in trained},
+        "speed": measurements.describe_speed(tables.read("speed")),
+    }
+
+
+def describe_experiment(name: str, episodes: pandas.DataFrame, runs: pandas.DataFrame) -> dict:
+    """Scores, lost points, and the budget of one seed with all that was driven before it."""
+    own = episodes[episodes.experiment == name]
+    returns = tables.returns_of(own)[name]
+    run = runs[(runs.experiment == name) & (runs.role == "run")]
+    planned = EXPERIMENTS.get(name)
+    return {
+        "about": planned.about if planned else BASELINE_DRIVERS[name],
+        "variant": planned.config.variant if planned else None,
+        "seeds": len(returns),
+        "planned_seeds": len(planned.seeds) if planned else 1,
+        "world_models": len(run[["vae", "mdn_rnn"]].dropna().drop_duplicates()),
+        **statistics.summarise(returns),
+        **statistics.describe_tail(returns),
+        "best_90": float(np.sort(returns, axis=1)[:, -BEST:].mean()),
+        "runs": returns.mean(axis=1).tolist(),
+        **{unit: float(run[f"total.{unit}"].mean()) for unit in tables.UNITS},
+        "lost": measurements.lost_points(own["return"].to_numpy(), own["frames"].to_numpy()),
+    }
+
+
+def compare_recipe(returns: dict[str, np.ndarray], recipe: str) -> dict:
+    """The four variants of a recipe, and the difference of three of them to `frame`.
+
+    "interval" is Student's t of the run means, the variance pooled over all four variants;
+    "bootstrap_interval" resamples seeds and tracks.
+    """
+    scores = [returns[f"{recipe}_{variant}"] for variant in VARIANTS]
+    runs = [own.mean(axis=1) for own in scores]
+    found = {"about": RECIPES[recipe]}
+    for place, variant in enumerate(VARIANTS):
+        found[variant] = {
+            "mean": float(scores[place].mean()),
+            "bootstrap_interval_of_mean": statistics.bootstrap(scores[place]),
+            "runs": runs[place].tolist(),
+        }
+        if variant != "frame":
+            found[variant] |= {
+                "difference": float(scores[place].mean() - scores[0].mean()),
+                "interval": statistics.pooled_interval(runs, 0, place),
+                "bootstrap_interval": statistics.bootstrap_difference(scores[0], scores[place]),
+                "welch_p": statistics.welch_p(runs[0], runs[place]),
+                "difference_by_seed": (runs[place] - runs[0]).tolist(),
+            }
+    return found
+
+
+def find_verdict(recipes: dict, best_episode: float, yaw_rate: dict) -> dict:
+    """Whether `input_output` beats `frame` as the paper says, with the reasons.
+
+    A recipe can test the claim if `frame` reaches BASELINE_PASSES and our best episode leaves room
+    for the paper's gain. It supports the claim if the interval of the difference is above 0, and
+    contradicts it if the interval is below that gain. If recipes disagree, the claim is open.
+    """
+    gain, found = PAPER["input_output"] - PAPER["frame"], {}
+    for name, recipe in recipes.items():
+        frame, compared = recipe["frame"]["mean"], recipe["input_output"]
+        low, high = compared["interval"]
+        reached, room = frame >= BASELINE_PASSES, best_episode - frame
+        outcome = "supported" if low > 0 else "contradicted" if high < gain else "open"
+        found[name] = {
+            **{"frame": frame, "paper_frame": PAPER["frame"], "baseline_passes": reached},
+            **{"room": room, "has_room": room >= gain},
+            **{"difference": compared["difference"], "interval": compared["interval"]},
+            "outcome": outcome if reached and room >= gain else "cannot test",
+        }
+    outcomes = {recipe["outcome"] for recipe in found.values()} - {"cannot test"}
+    return {
+        "word": outcomes.pop() if len(outcomes) == 1 else "open",
+        **{"claimed_gain": gain, "best_episode": best_episode},
+        "yaw_rate_in_latents": yaw_rate["input_output"]["lowest"] > yaw_rate["others"]["highest"],
+        **found,
+    }
+
+
+def describe_agents() -> dict:
+    """The shipped agents on the tracks 0 to 99, with Gymnasium's renderer."""
+    found = {}
+    for path in sorted(PRETRAINED.glob("*/evaluation.json")):
+        record, evaluation = load_json(path.with_name("record.json")), load_json(path)
+        returns = np.array([episode["return"] for episode in evaluation["episodes"]])
+        found[path.parent.name] = {
+            **statistics.summarise(returns),
+            **statistics.describe_tail(returns),
+            "without_worst_5": float(np.sort(returns)[5:].mean()),
+            "without_best_5": float(np.sort(returns)[:-5].mean()),
+            "gymnasium": record["made_with"]["gymnasium"],
+            **total_budget(record),
+        }
+    return found
+
+
+def learning_curve(
+    runs: pandas.DataFrame, generations: pandas.DataFrame, experiment: str, seed: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Episodes driven so far, and score, at each validation of a run: two arrays (validations,).
+
+    All episodes count: those of the dataset, of earlier runs, and of the validations.
+    """
+    named = f"experiment == {experiment!r} and role == 'run' and seed == {seed}"
+    run, log = runs.query(named).iloc[0], generations.query(named)
+    population, tracks, validations = (
+        run[f"config.evolution.{name}"] for name in ("population", "tracks", "validation_tracks")
+    )
+    own = run["budget.evolution.episodes"] + run["budget.validation.episodes"]
+    validated = log["validation.mean"].notna()
+    driven = run["total.episodes"] - own + log["generation"] * population * tracks
+    driven += validated.cumsum() * validations
+    return driven[validated].to_numpy(np.int64), log["validation.mean"][validated].to_numpy()
+
+
+def final_sigma(generations: pandas.DataFrame) -> dict:
+    """The last step size of each run of the paper's recipe, and the geometric mean of them."""
+    paper = generations[generations.experiment.str.startswith("paper_")]
+    last = paper.groupby(["experiment", "seed"])["sigma"].last()
+    each = {tables.key(*run): float(sigma) for run, sigma in last.items()}
+    return {"geometric_mean": float(np.exp(np.log(last).mean())), **each}
+
+
+def write_claims(path: Path = CLAIMS) -> Path:
+    """Compute all statistics and write them, a line for each name; returns the file."""
+    sections = []
+    for section, entries in compute_claims().items():
+        lines = [f"  {json.dumps(name)}: {json.dumps(entry)}" for name, entry in entries.items()]
+        sections.append(f" {json.dumps(section)}: {{\n" + ",\n".join(lines) + "\n }")
+    write_bytes(path, ("{\n" + ",\n".join(sections) + "\n}\n").encode())
+    return path
+
+
+def read_claims(path: Path = CLAIMS) -> dict:
+    """What `write_claims` wrote."""
+    return json.loads(path.read_text(encoding="utf-8"))

@@ -1,0 +1,95 @@
+"""What the pages show beside mean scores: lost points, the probe, quality of V and M, speeds.
+
+Each function turns a table into nested dicts of plain numbers, for `stad_lab.replication.claims`.
+"""
+
+from collections import defaultdict
+
+import numpy as np
+import pandas
+
+from stad_lab.config import VARIANTS
+from stad_lab.evaluation.statistics import FAILED, SOLVED
+from stad_lab.replication.tables import key
+
+REFERENCES = (  # conditions of `speed` with which the others of their measure are compared
+    "Gymnasium", "Gymnasium alone, no agent, 2 processes", "1 car", "plain", "own processes, 1",
+)  # fmt: skip
+
+
+def describe_fast(episodes: pandas.DataFrame) -> dict:
+    """Agents with the fast renderer on the tracks 0 to 199, by processor."""
+    found = defaultdict(dict)
+    for (agent, processor), scores in episodes.groupby(["agent", "processor"])["return"]:
+        failed = int((scores < FAILED).sum())
+        found[agent][processor] = {"mean": float(scores.mean()), "failed": failed}
+    wide = episodes.pivot(index=["agent", "track"], columns="processor", values="return").dropna()
+    equal = int((wide.nunique(axis=1) == 1).sum())
+    return {**found, "equal_returns": equal, "compared_episodes": len(wide)}
+
+
+def yaw_rate_of_z(probe: pandas.DataFrame) -> dict:
+    """R2 of the yaw rate from z, under the agent, for each V that was trained without the bar."""
+    asked = probe.query("driver == 'agent' and features == 'z' and quantity == 'yaw rate'")
+    asked = asked[asked.trained & ~asked.indicator_bar]
+    asked = asked[~asked.world_model.str.startswith("shorter_")]  # trained for fewer steps
+    values = {variant: sorted(asked.r2[asked.variant == variant]) for variant in VARIANTS}
+    values["others"] = sorted(asked.r2[asked.variant != "input_output"])
+    return {
+        name: {"trainings": len(r2), "lowest": r2[0], "highest": r2[-1], "values": r2}
+        for name, r2 in values.items()
+    }
+
+
+def describe_probe(probe: pandas.DataFrame) -> dict:
+    """R2 by "DRIVER: WORLD_MODEL-SEED", features and quantity."""
+    found = defaultdict(lambda: defaultdict(dict))
+    for line in probe.itertuples():
+        name = f"{line.driver}: {key(line.world_model, line.seed)}"
+        found[name][line.features][line.quantity] = line.r2
+    return found
+
+
+def describe_models(metrics: pandas.DataFrame) -> dict:
+    """Values by "MODEL: WORLD_MODEL" and metric, and by index where a metric has several."""
+    found = defaultdict(dict)
+    for (model, world_model, metric), own in metrics.groupby(["model", "world_model", "metric"]):
+        values = dict(zip(own["index"], own["value"].tolist(), strict=True))
+        found[f"{model}: {world_model}"][metric] = values.get("all", values)
+    return found
+
+
+def stage_minutes(runs: pandas.DataFrame, name: str) -> dict:
+    """Minutes of each stage, from an empty folder to the evaluated agent of seed 0."""
+    own = runs[(runs.experiment == name) & (runs.seed == 0)].filter(like="seconds.")
+    minutes = {column.removeprefix("seconds."): own[column].sum() / 60 for column in own}
+    return {
+        stage: float(value) for stage, value in (minutes | {"all": sum(minutes.values())}).items()
+    }
+
+
+def describe_speed(speed: pandas.DataFrame) -> dict:
+    """Median over the rounds, and ratio to the reference, by "PART: MEASURE" and condition."""
+    found = {}
+    for (part, measure), own in speed.groupby(["part", "measure"]):
+        medians = own.groupby("condition")["value"].median().to_dict()
+        for reference in set(REFERENCES) & set(medians):
+            unit = medians[reference]
+            medians = {name: {"median": m, "ratio": m / unit} for name, m in medians.items()}
+        found[f"{part}: {measure}"] = medians
+    return found
+
+
+def lost_points(returns: np.ndarray, frames: np.ndarray) -> dict:
+    """Where the points up to 1,000 were lost, means over episodes; the parts sum to 1000 - mean.
+
+    "speed": 0.1 for each frame of a mean complete lap; "waiting": 0.1 for each further frame, due
+    to a missed tile; "tiles": those not visited, and 100 points for leaving the field.
+    """
+    laps = frames[returns >= SOLVED]  # a lap of 1,000 frames has 900 points
+    speed = laps.mean() if len(laps) else frames.mean()
+    return {
+        "speed": float(0.1 * speed),
+        "waiting": float(0.1 * (frames.mean() - speed)),
+        "tiles": float((1000 - returns - 0.1 * frames).mean()),
+    }
