@@ -1,12 +1,13 @@
 """A batch of CarRacing episodes: tracks, random numbers, physics and pictures together."""
 
-import functools
+import threading
 from collections.abc import Sequence
 
 import numpy as np
 from gymnasium.utils import seeding
 
 from stad_lab.envs import physics, picture
+from stad_lab.envs.compiling import announced
 from stad_lab.envs.frames import FRAME_SIZE, OBSERVATION_SIZE
 from stad_lab.envs.track import MAX_TILES, TRACK_WIDTH, Track, make_track
 
@@ -53,6 +54,7 @@ class Cars:
         lap_complete_percent: float = 0.95,
         domain_randomize: bool = False,
     ):
+        warm_up()
         self.shows, self.bar, self.continuous = shows, bar, continuous
         self.lap_complete_percent = float(lap_complete_percent)
         self.domain_randomize = domain_randomize
@@ -197,6 +199,20 @@ def road_polygons(track: Track) -> tuple[np.ndarray, np.ndarray]:
     return polygons, np.concatenate(kinds)[order].astype(np.uint8)
 
 
-@functools.cache
 def warm_up() -> None:
-    """Compile the engine, or load what was compiled before; says so if it takes long."""
+    """Compile the engine, or load what was compiled before, once in this process."""
+    global _warm
+    with _warming:
+        if _warm:
+            return
+        _warm = True  # for the cars below, which come back here
+        with announced():
+            for shows in SIZES:
+                cars = Cars(1, shows)
+                cars.reset()
+                cars.place(0, 0)
+                cars.step(np.zeros((1, 3)))
+                cars.draw()
+
+
+_warming, _warm = threading.RLock(), False

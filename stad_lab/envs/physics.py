@@ -50,8 +50,8 @@ this file, since Numba's cache does not notice when a function in another file c
 import math
 
 import numpy as np
-from numba import njit
 
+from stad_lab.envs.compiling import compiled
 from stad_lab.envs.track import MAX_TILES
 
 f32 = np.float32
@@ -162,7 +162,7 @@ ROAD = np.dtype(
 # --- Shapes and masses ----------------------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def convex_hull(points, hull):
     """Wrap points as Box2D does: from the rightmost one, counter-clockwise, without collinear ones.
 
@@ -269,7 +269,7 @@ WHEEL = np.int64(len(HULL_SHAPES))  # the wheel's row in SHAPES
 # --- 1. Throttle, brakes, steering and tyres ------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def control(car, steering, gas, brake):
     """Set the controls. Gas rises by at most 0.1 a frame, everything else acts at once."""
     car.steer[0] = car.steer[1] = -steering
@@ -280,7 +280,7 @@ def control(car, steering, gas, brake):
         car.brake[i] = brake
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def drive_wheels(car):
     """Turn the controls into motor speeds of the joints, and into the force of each tyre."""
     for i in range(WHEELS):
@@ -309,7 +309,7 @@ def drive_wheels(car):
         car.force[1 + i, 1] = f32(side * sine + forward * cosine)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def slow_down(omega, brake):
     """The rotation of a wheel after braking for one frame. From 0.9 on the brake locks it."""
     if brake >= 0.9:
@@ -322,7 +322,7 @@ def slow_down(omega, brake):
 # --- 2. Which tiles does the car touch? -----------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def touch_tiles(car, road, simplex, corners):
     """Find the tiles under the car, before it moves, and reward those that a wheel touches first.
 
@@ -368,7 +368,7 @@ def touch_tiles(car, road, simplex, corners):
             road.darkened[tile] = touched
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def wheel_touches(car, i, road, tile, simplex, corners):
     """Whether wheel i touches a tile. Where rounding could decide, Box2D's own test is made."""
     x, y = car.position[1 + i, 0], car.position[1 + i, 1]
@@ -385,7 +385,7 @@ def wheel_touches(car, i, road, tile, simplex, corners):
     return inside or polygons_touch(road, tile, car, 1 + i, WHEEL, simplex, corners)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def polygons_touch(road, tile, car, body, shape, simplex, corners):
     """Whether a polygon of the car and a tile touch: Box2D's test, that their skins overlap.
 
@@ -430,7 +430,7 @@ def polygons_touch(road, tile, car, body, shape, simplex, corners):
     return skins_overlap(simplex, count)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def add_corner(road, tile, car, body, shape, a, b, row, numbers):
     """Write the corner b - a of the polygon of differences into a row of the simplex."""
     cosine, sine = car.rotation[body, 0], car.rotation[body, 1]
@@ -442,7 +442,7 @@ def add_corner(road, tile, car, body, shape, a, b, row, numbers):
     numbers[0], numbers[1] = a, b
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def furthest_on_tile(road, tile, dx, dy):
     """The corner of a tile that lies furthest in a direction."""
     best = 0
@@ -454,7 +454,7 @@ def furthest_on_tile(road, tile, dx, dy):
     return best
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def furthest_on_car(car, body, shape, dx, dy):
     """The corner of a polygon of the car that lies furthest in a direction."""
     cosine, sine = car.rotation[body, 0], car.rotation[body, 1]
@@ -468,7 +468,7 @@ def furthest_on_car(car, body, shape, dx, dy):
     return best
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def towards_origin(simplex, count):
     """A direction from a point, or from an edge at right angles, to the origin."""
     if count == 1:
@@ -479,20 +479,20 @@ def towards_origin(simplex, count):
     return ey, -ex
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def cross(ax, ay, bx, by):
     """The cross product of two vectors."""
     return ax * by - ay * bx
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def along(ax, ay, bx, by):
     """The weights of a and b, up to a common factor, in the point of line ab nearest to zero."""
     ex, ey = bx - ax, by - ay
     return bx * ex + by * ey, -(ax * ex + ay * ey)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def nearest_point(simplex, count):
     """Find the point of an edge or a triangle nearest to the origin.
 
@@ -529,7 +529,7 @@ def nearest_point(simplex, count):
     return 3, 0, 1, ZERO, ZERO
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def keep_corners(simplex, corners, j, k, weight_j, weight_k):
     """Move the corners j and k of the simplex to its rows 0 and 1, and store their weights."""
     scale = ONE / (weight_j + weight_k)
@@ -540,7 +540,7 @@ def keep_corners(simplex, corners, j, k, weight_j, weight_k):
         corners[row, 0], corners[row, 1] = corners[corner, 0], corners[corner, 1]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def skins_overlap(simplex, count):
     """Whether the nearest points of the two polygons are closer than their skins are thick."""
     if count == 1:
@@ -568,7 +568,7 @@ RX, RY, K11, K12, K22, K13, K23, SCALE2, SCALE3, NX, NY, NZ = range(12)
 K33 = HULL_INV_INERTIA + WHEEL_INV_INERTIA
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def solve(car, state, saved, joints, pushes):
     """One time step: forces, joints, motion, and sleep.
 
@@ -592,7 +592,7 @@ def solve(car, state, saved, joints, pushes):
     fall_asleep(car, solved)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def apply_forces(car, state):
     """Change velocities by the forces on the wheels, and collect the numbers of the sweeps."""
     for body in range(BODIES):
@@ -607,7 +607,7 @@ def apply_forces(car, state):
         state[STOPPER + i] = car.stop[i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def prepare_joints(car, state, joints):
     """Set up each joint for this step, and apply its impulses of the last frame again.
 
@@ -647,7 +647,7 @@ def prepare_joints(car, state, joints):
         state[w + 2] += ib * (motor + stop)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def solve_velocities(car, state, saved, joints, pushes):
     """Sweep over the joints `VELOCITY_SWEEPS` times, or skip what only repeats itself.
 
@@ -688,7 +688,7 @@ def solve_velocities(car, state, saved, joints, pushes):
         add_push(car, pushes[0])
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def add_push(car, push):
     """Add what one sweep has pushed to the accumulated impulses of the points."""
     for i in range(WHEELS):
@@ -696,7 +696,7 @@ def add_push(car, push):
         car.push[i, 1] += push[i, 1]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def sweep(car, state, joints, push):
     """Repair the velocity error of each joint once: its motor, then its stop and its point.
 
@@ -739,14 +739,14 @@ def sweep(car, state, joints, push):
     state[0], state[1], state[2] = vax, vay, wa
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def solve_point(joints, i, bx, by):
     """The impulse p that solves K p = b at joint i."""
     k11, k12, k22, scale = joints[i, K11], joints[i, K12], joints[i, K22], joints[i, SCALE2]
     return scale * (k22 * bx - k12 * by), scale * (k11 * by - k12 * bx)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def solve_stop(joints, i, ex, ey, spin, so_far, at_stop):
     """The impulse at joint i that repairs point and stop together, unless the stop would pull.
 
@@ -777,7 +777,7 @@ def solve_stop(joints, i, ex, ey, spin, so_far, at_stop):
     return -px, -py, -turn
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def move(car, state):
     """Change positions by velocities, within the caps on the motion of one step."""
     for body in range(BODIES):
@@ -799,7 +799,7 @@ def move(car, state):
         car.stop[i] = state[STOPPER + i]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def solve_positions(car):
     """Repair the position error of each joint once; return whether all errors were small.
 
@@ -836,7 +836,7 @@ def solve_positions(car):
     return small
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def stop_error(angle, at_stop):
     """How far a joint has turned beyond its stop, and the impulse that turns it back, radians."""
     if at_stop < 0:
@@ -848,7 +848,7 @@ def stop_error(angle, at_stop):
     return excess, -TURN_MASS * back
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def place_body(car, body):
     """Derive a body's rotation and origin from its angle and centre of mass."""
     cosine, sine = math.cos(car.angle[body]), math.sin(car.angle[body])
@@ -858,7 +858,7 @@ def place_body(car, body):
     car.position[body, 1] = car.center[body, 1] - (sine * x + cosine * y)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def fall_asleep(car, solved):
     """Stop all bodies after half a second in which none moved faster than a threshold.
 
@@ -882,7 +882,7 @@ def fall_asleep(car, solved):
 # --- 4. Reward, start, and many cars --------------------------------------------------------------
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def advance(car, road, memory):
     """One frame of the world with the controls as they are set."""
     state, saved, joints, pushes, simplex, corners = memory
@@ -892,7 +892,7 @@ def advance(car, road, memory):
     car.time += FRAME
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def score(car, road):
     """The reward of a frame, float64; sets `ending`."""
     car.ending = DRIVING
@@ -907,7 +907,7 @@ def score(car, road):
     return reward
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def make_memory():
     """What one thread needs besides the records: arrays that hold nothing between frames."""
     return (
@@ -920,7 +920,7 @@ def make_memory():
     )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def step_cars(cars, roads, which, actions, rewards):
     """Drive some cars for one frame. Releases the GIL: threads may step different cars at once.
 
@@ -940,7 +940,7 @@ def step_cars(cars, roads, which, actions, rewards):
         rewards[n] = score(car, road)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def start_car(cars, roads, n, path, tiles, lap_complete):
     """Begin an episode of car n: lay out the road, and let one frame pass, as Gymnasium does.
 
@@ -959,7 +959,7 @@ def start_car(cars, roads, n, path, tiles, lap_complete):
     advance(car, road, make_memory())
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def put_at_rest(car, heading, x, y):
     """Make a new car at rest. Its wheels are placed as if it faced north, as Gymnasium does.
 
@@ -992,7 +992,7 @@ def put_at_rest(car, heading, x, y):
         car.steer[i] = car.gas[i] = car.brake[i] = car.omega[i] = car.phase[i] = 0.0
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def place_car(cars, n, heading, x, y, speed):
     """Replace car n by a new one that moves straight ahead, its wheels rolling.
 
@@ -1020,7 +1020,7 @@ def place_car(cars, n, heading, x, y, speed):
     car.time = max(car.time, 1.0)  # the opening zoom is over
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def lay_road(road, tiles):
     """Fill a ROAD record with the tiles of a track, float64 (n, 4, 2), none of them visited."""
     road.tiles = len(tiles)

@@ -41,10 +41,11 @@ import numpy as np
 import pygame
 from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
-from numba import njit
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
-merged = njit(cache=True, nogil=True, error_model="numpy", inline="always")  # into its one caller
+from stad_lab.envs.compiling import compiled
+
+fast = compiled(error_model="numpy")
+merged = compiled(error_model="numpy", inline="always")  # into its one caller
 
 # The pictures, and Gymnasium's window, whose coordinates we share.
 OBSERVATION_SIZE = 96  # pixels, width and height of the observation
@@ -187,7 +188,7 @@ def ground_colors(background: np.ndarray, grass: np.ndarray, road: np.ndarray) -
 # Painting
 
 
-@compiled
+@fast
 def paint(ground, car, road, kinds, colors):
     """Paint the track of a new episode over the last one.
 
@@ -209,7 +210,7 @@ def paint(ground, car, road, kinds, colors):
     shrink(ground, car, new_colors)
 
 
-@compiled
+@fast
 def restore(texels, cells, pattern):
     """Give the cells with road the texels of background and grass again."""
     for i in range(CELLS):
@@ -223,7 +224,7 @@ def restore(texels, cells, pattern):
                         texels[row, j * CELL + k] = pattern[line, column + k]
 
 
-@compiled
+@fast
 def to_texels(corners, polygon):
     """Write the corners of a polygon in world units, float64 (n, 2), in texels."""
     for i in range(len(polygon)):
@@ -231,7 +232,7 @@ def to_texels(corners, polygon):
         corners[i, 1] = polygon[i, 1] * SCALE + ORIGIN
 
 
-@compiled
+@fast
 def bounds(corners):
     """Smallest and largest x, smallest and largest y of a polygon, float64 (n, 2)."""
     left = right = corners[0, 0]
@@ -242,7 +243,7 @@ def bounds(corners):
     return left, right, low, high
 
 
-@compiled
+@fast
 def column_range(corners, row, width):
     """First and end of the pixels of a row whose centres lie in a convex polygon."""
     y = row + 0.5
@@ -257,7 +258,7 @@ def column_range(corners, row, width):
     return max(0, math.ceil(left - 0.5)), min(width, math.ceil(right - 0.5))
 
 
-@compiled
+@fast
 def fill_polygon(canvas, corners, value):
     """Set the pixels whose centres lie in a convex polygon.
 
@@ -274,7 +275,7 @@ def fill_polygon(canvas, corners, value):
             canvas[row, column] = value
 
 
-@compiled
+@fast
 def visit(ground, car, tile):
     """Give a tile that the car has touched the first shade of the road, as Gymnasium does.
 
@@ -291,7 +292,7 @@ def visit(ground, car, tile):
                 texels[row, column] &= EDGE | NEAR | KIND
 
 
-@compiled
+@fast
 def mark_cells(cells, corners):
     """Mark the cells around a polygon, corners in texels, with room for the flags it causes."""
     left, right, low, high = bounds(corners)
@@ -300,7 +301,7 @@ def mark_cells(cells, corners):
             cells[i, j] = HAS_ROAD | CHANGED
 
 
-@compiled
+@fast
 def mark_edges(texels, cells):
     """Set the flags EDGE and NEAR in the cells with road and in those between them."""
     for i in range(CELLS):
@@ -315,7 +316,7 @@ def mark_edges(texels, cells):
             mark_near_row(three[0], three[1], three[2], around)
 
 
-@compiled
+@fast
 def road_columns(cells):
     """First texel and end of the cells with road in a row of cells, uint8 (CELLS,)."""
     first, end = SIZE, 0
@@ -325,7 +326,7 @@ def road_columns(cells):
     return first, min(end, SIZE - 1)
 
 
-@compiled
+@fast
 def mark_edge_row(line, above):
     """EDGE: do the four texels from here to the right and up differ in kind?
 
@@ -340,7 +341,7 @@ def mark_edge_row(line, above):
         line[x] = (here & ~EDGE) | flag
 
 
-@compiled
+@fast
 def mark_near_row(below, line, above, around):
     """NEAR: is there an EDGE among the 3 x 3 texels around this one?
 
@@ -355,7 +356,7 @@ def mark_near_row(below, line, above, around):
         line[x] |= np.uint8(around[x - 1] | around[x] | around[x + 1]) >> 1
 
 
-@compiled
+@fast
 def set_palette(palette, own, colors):
     """Store the colours, uint8 (8, 3), and make the palette; returns whether they are new.
 
@@ -375,7 +376,7 @@ def set_palette(palette, own, colors):
     return new
 
 
-@compiled
+@fast
 def shrink(ground, car, everywhere):
     """Average the texels of the changed cells, or of all, down to the smaller copies."""
     texels, palette, cells = ground.texels[car], ground.palette[car], ground.cells[car]
@@ -393,7 +394,7 @@ def shrink(ground, car, everywhere):
                 sixteenth[i, j] = average_4(eighth, 2 * i, 2 * j)
 
 
-@compiled
+@fast
 def average_16(texels, palette, row, column):
     """Mean colour of 4 x 4 texels, uint32."""
     if not texels[row + 1, column + 1] & NEAR:  # all of one kind
@@ -405,7 +406,7 @@ def average_16(texels, palette, row, column):
     return to_bytes((total >> np.uint64(4)) & LANES)
 
 
-@compiled
+@fast
 def average_4(colors, row, column):
     """Mean colour of 2 x 2 colours, uint32."""
     total = np.uint64(0)
@@ -415,14 +416,14 @@ def average_4(colors, row, column):
     return to_bytes((total >> np.uint64(2)) & LANES)
 
 
-@compiled
+@fast
 def to_bytes(color):
     """A colour in 16-bit lanes, uint64, to one in bytes, uint32: red is lowest."""
     red, green = color & np.uint64(0xFF), (color >> np.uint64(8)) & np.uint64(0xFF00)
     return np.uint32(red | green | (color >> np.uint64(16)) & np.uint64(0xFF0000))
 
 
-@compiled
+@fast
 def to_lanes(color):
     """A colour in bytes, uint32, to one in 16-bit lanes, uint64."""
     wide = np.uint64(color)
@@ -433,13 +434,13 @@ def to_lanes(color):
 # The warp
 
 
-@compiled
+@fast
 def camera_zoom(time):
     """Window pixels per world unit, `time` seconds after the start: the first second zooms in."""
     return 0.1 * reference.SCALE * max(1 - time, 0.0) + ZOOM * min(time, 1.0)
 
 
-@compiled
+@fast
 def look(out, ground, car, pose, zoom, pixel, corner):
     """Draw what the camera sees of the ground.
 
@@ -473,13 +474,13 @@ def look(out, ground, car, pose, zoom, pixel, corner):
         warp_colors(out, copy[car], start, across, down)
 
 
-@compiled
+@fast
 def to_fixed(position):
     """A position or step in texels as a fixed-point number, int64."""
     return math.floor(min(max(position, -1e9), 1e9) * ONE)
 
 
-@compiled
+@fast
 def columns_inside(start, step, columns, size):
     """First and end of the columns in 0 to `columns` where 0 <= start + column * step < size."""
     last = size * ONE - 1
@@ -492,7 +493,7 @@ def columns_inside(start, step, columns, size):
     return max(0, first), min(columns, end)
 
 
-@compiled
+@fast
 def columns_on_texture(x, y, across, columns, size):
     """First and end of the columns of a row that see a texture; the others see black.
 
@@ -533,7 +534,7 @@ def warp_texels(out, ground, car, start, across, down, fine):
     smooth_edges(pixels, nearest, texels, palette, columns, start, across, down, fine)
 
 
-@compiled
+@fast
 def read_texels(line, texels, x, y, across, first, end):
     """Read the texels under the columns of a row; those before `first` and from `end` on are black.
 
@@ -554,7 +555,7 @@ def read_texels(line, texels, x, y, across, first, end):
         y += across[1]
 
 
-@compiled
+@fast
 def write_colors(pixels, nearest, colors):
     """Turn the texels of pixels into colours, uint8 (3 n,): red, green, blue, red, ...
 
@@ -585,13 +586,13 @@ def row_of(colors, i):
     return colors[i, 0], colors[i, 1], colors[i, 2]
 
 
-@compiled
+@fast
 def channels(color):
     """Red, green and blue, uint8, of a colour in 16-bit lanes."""
     return np.uint8(color), np.uint8(color >> np.uint64(16)), np.uint8(color >> np.uint64(32))
 
 
-@compiled
+@fast
 def find_flagged(found, nearest, flag):
     """List the pixels whose texel has a flag; returns how many there are.
 
@@ -644,13 +645,13 @@ def smooth_edges(pixels, nearest, texels, palette, columns, start, across, down,
         write(pixels, np.uint64(3) * np.uint64(pixel), color)
 
 
-@compiled
+@fast
 def weights(x, y):
     """How far a fixed-point position is beyond the texel to its left and below, in sixteenths."""
     return np.uint64((x >> (FRACTION - 4)) & 15), np.uint64((y >> (FRACTION - 4)) & 15)
 
 
-@compiled
+@fast
 def interpolate(texels, palette, x, y):
     """Bilinear interpolation of four texels: 256 times the colour, in 16-bit lanes."""
     right, up = weights(x, y)
@@ -662,7 +663,7 @@ def interpolate(texels, palette, x, y):
     return lower * down + upper * up + ROUND
 
 
-@compiled
+@fast
 def warp_colors(out, colors, start, across, down):
     """Warp a smaller copy of the texture, uint32 (n, n), with interpolation at every pixel."""
     rows, columns = out.shape[0], out.shape[1]
@@ -677,7 +678,7 @@ def warp_colors(out, colors, start, across, down):
             write(pixels, np.uint64(3 * (row * columns + column)), color)
 
 
-@compiled
+@fast
 def interpolate_colors(colors, x, y):
     """As `interpolate`, of a smaller copy of the texture."""
     right, up = weights(x, y)
@@ -689,7 +690,7 @@ def interpolate_colors(colors, x, y):
     return lower * down + upper * up + ROUND
 
 
-@compiled
+@fast
 def write(pixels, place, color):
     """Write 256 times a colour, in 16-bit lanes, to three bytes from `place` on."""
     red, green, blue = channels(color >> np.uint64(8))
@@ -701,7 +702,7 @@ def write(pixels, place, color):
 # The car
 
 
-@compiled
+@fast
 def draw_car(out, pictures, wheels, zoom, corner):
     """Blend the car over a part of the observation.
 
@@ -732,7 +733,7 @@ def draw_car(out, pictures, wheels, zoom, corner):
                     out[top + row, left + column, channel] = ground + quarter[row, column, channel]
 
 
-@compiled
+@fast
 def draw_quarter(quarter, place, turn, phase, zoom):
     """Draw a quarter of the car with one wheel.
 
@@ -768,7 +769,7 @@ def draw_quarter(quarter, place, turn, phase, zoom):
     average_quarter(quarter, canvas, origin)
 
 
-@compiled
+@fast
 def wheel_stripe(phase):
     """Ends of the light stripe on a turning wheel, in radii along it; (1, -1) if hidden."""
     sin1, sin2 = math.sin(phase), math.sin(phase + 1.2)
@@ -828,7 +829,7 @@ def average_quarter(quarter, canvas, origin):
             quarter[row, column, 3] = int(255 * covered + 0.5)
 
 
-@compiled
+@fast
 def average_patch(frame, patch, rows, columns):
     """Average observation pixels around the car to the pixels of the agent's frame.
 
@@ -860,7 +861,7 @@ def average_patch(frame, patch, rows, columns):
 # The indicator bar
 
 
-@compiled
+@fast
 def draw_bar(out, score, speed, spin, wheels, reward):
     """Draw the score and the seven indicators over the lower edge of a picture.
 
@@ -886,7 +887,7 @@ def draw_bar(out, score, speed, spin, wheels, reward):
     draw_sideways(out, 30.0, -0.8 * spin, spin, 253.0, 0.0)
 
 
-@compiled
+@fast
 def score_index(reward):
     """Where the table of scores has the picture of a reward."""
     score = round(min(max(reward, float(MIN_SCORE)), float(MAX_SCORE)))
@@ -895,7 +896,7 @@ def score_index(reward):
     return int(score) - MIN_SCORE
 
 
-@compiled
+@fast
 def draw_upright(out, place, length, value, red, green, blue):
     """A vertical indicator, `place` / 40 of the width from the left, `length` / 40 high."""
     if abs(value) > 1e-4:
@@ -904,7 +905,7 @@ def draw_upright(out, place, length, value, red, green, blue):
         draw_rectangle(out, place * unit, (place + 1) * unit, top, end, red, green, blue)
 
 
-@compiled
+@fast
 def draw_sideways(out, place, length, value, red, green):
     """A horizontal indicator, `place` / 40 of the width from the left, `length` / 40 of it."""
     if abs(value) > 1e-4:
@@ -913,7 +914,7 @@ def draw_sideways(out, place, length, value, red, green):
         draw_rectangle(out, begin, end, WINDOW_H - 4 * unit, WINDOW_H - 2 * unit, red, green, 0.0)
 
 
-@compiled
+@fast
 def draw_rectangle(out, x1, x2, y1, y2, red, green, blue):
     """Blend an upright rectangle over a picture.
 
@@ -938,7 +939,7 @@ def draw_rectangle(out, x1, x2, y1, y2, red, green, blue):
 # Whole pictures
 
 
-@compiled
+@fast
 def all_finite(hull, wheels, reward):
     """Whether no number of the car's state is infinite or NaN."""
     total = reward
@@ -994,21 +995,7 @@ def draw_picture(out, ground, pictures, car, hull, wheels, reward, time, bar):
         out[BAR_TOP:] = 0
 
 
-@compiled
-def draw_pictures(out, ground, pictures, hulls, wheels, rewards, times, bar):
-    """Draw the pictures of all cars: the arguments of `draw_picture` with an axis for the cars.
-
-    Args:
-        out: uint8 (cars, 96, 96, 3) or (cars, 64, 64, 3), to write.
-        hulls: float64 (cars, 5); `wheels`: float64 (cars, 4, 3).
-        rewards, times: float64 (cars,).
-    """
-    for car in range(len(out)):
-        hull, wheel, reward, time = hulls[car], wheels[car], rewards[car], times[car]
-        draw_picture(out[car], ground, pictures, car, hull, wheel, reward, time, bar)
-
-
-@compiled
+@fast
 def draw_cars(out, ground, pictures, which, cars, roads, tiles, bar):
     """Draw what some cars see; tiles that they have touched since the last time change colour.
 
@@ -1035,9 +1022,8 @@ def draw_cars(out, ground, pictures, which, cars, roads, tiles, bar):
         for i in range(4):
             wheels[i, 0] = car.angle[1 + i] - car.angle[0]
             wheels[i, 1], wheels[i, 2] = car.phase[i], car.omega[i]
-        shown = (
-            car.reward + 0.1 if car.frames else car.reward
-        )  # Gymnasium draws before it takes 0.1
+        # Gymnasium draws before it takes 0.1 off.
+        shown = car.reward + 0.1 if car.frames else car.reward
         draw_picture(out[n], ground, pictures, number, hull, wheels, shown, car.time, bar)
 
 

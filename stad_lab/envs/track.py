@@ -19,7 +19,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+
+from stad_lab.envs.compiling import compiled
 
 SCALE = 6.0  # Gymnasium divides all sizes of the track by it
 TRACK_RADIUS = 900 / SCALE  # world units; most checkpoints lie at 1/3 to 1 of it
@@ -86,7 +87,7 @@ def tile_colors(count: int, road_color: np.ndarray) -> np.ndarray:
     return road_color + (0.01 * (np.arange(count) % 3) * 255)[:, None]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def find_path(draws):
     """Steps 1 to 3: the closed path from uniform random numbers.
 
@@ -110,7 +111,7 @@ def find_path(draws):
     return track
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def place_checkpoints(draws):
     """Step 1: float64 (12, 3) with angle, x and y of each checkpoint."""
     checkpoints = np.empty((CHECKPOINTS, 3))
@@ -129,7 +130,7 @@ def place_checkpoints(draws):
     return checkpoints
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def walk(checkpoints):
     """Step 2: go from checkpoint to checkpoint; float64 (steps, 4) as `Track.path`."""
     track = np.empty((MAX_TILES, 4))
@@ -173,7 +174,7 @@ def walk(checkpoints):
             return track[:steps]
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def next_checkpoint(checkpoints, goal, alpha):
     """The next checkpoint beyond the angle `alpha`, and `alpha`, less a full turn after a lap."""
     while True:
@@ -186,7 +187,7 @@ def next_checkpoint(checkpoints, goal, alpha):
         alpha -= 2 * math.pi
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def find_lap(track):
     """Step 3: the points where the last two laps begin, (-1, -1) if there are none."""
     last = -1
@@ -198,7 +199,7 @@ def find_lap(track):
     return -1, -1
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def pave(path):
     """Step 4: the tiles and kerbs along a closed path, in the order of `Track`."""
     count = len(path)
@@ -220,7 +221,7 @@ def pave(path):
     return tiles, kerbs, kerb_tiles, kerb_colors
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def span(path, i, left, right, corners):
     """Write the corners of a strip from point i back to i - 1, `left` to `right` of the centre."""
     for end in range(2):
@@ -231,7 +232,7 @@ def span(path, i, left, right, corners):
         corners[second, 0], corners[second, 1] = x + right * across_x, y + right * across_y
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def find_bends(path):
     """Whether each tile has a kerb: bool (n,)."""
     count = len(path)
