@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+from stad_lab import make_env
 from stad_lab.agent import encode_episode, remember_episode
 from stad_lab.config import TRACK_RANGES, Config, track_seeds
 from stad_lab.envs.cars import Cars
@@ -100,8 +101,9 @@ def test_a_random_trajectory_is_as_in_the_dataset_but_on_a_track_of_its_own(
     assert TRACK_RANGES["inspect"][0] <= tracks[0] < TRACK_RANGES["inspect"][1]
 
 
-def test_an_agent_s_trajectory_is_recorded_as_it_was_driven(agent, env):
+def test_an_agent_s_trajectory_is_recorded_as_it_was_driven(agent):
     trajectory = record_trajectory(agent, track=4, frames=20)
+    env = make_env()
     observation, _ = env.reset(seed=4)
     agent.reset()
     for t in range(20):
@@ -116,7 +118,7 @@ def test_an_agent_s_trajectory_is_recorded_as_it_was_driven(agent, env):
 
 def test_a_trajectory_without_a_frame_is_refused():
     with pytest.raises(ValueError, match="without a frame: drive at least one frame"):
-        Recorder().trajectory([])
+        Recorder(Cars(1)).trajectory([])
 
 
 def test_an_inspection_is_what_the_agent_saw(agent):
