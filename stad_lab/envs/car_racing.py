@@ -12,7 +12,7 @@ from gymnasium.envs.box2d import car_racing as reference
 from stad_lab.envs import physics
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import OBSERVATION_SHAPE
-from stad_lab.envs.track import KERB_COLORS, tile_colors
+from stad_lab.envs.track import KERB_COLORS, TRACK_WIDTH, tile_colors
 
 MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 FAST_ID = "StadLab/CarRacing-v3"
@@ -34,13 +34,32 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
 
 
-def place_car(env: gym.Env, tile: int, **how) -> np.ndarray:
-    """Put the car of `make_env()` on a tile, moving; returns the observation there.
+def place_car(
+    env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, offset: float = 0.0
+) -> np.ndarray:
+    """Put the car on a tile of its track, moving; returns the observation there.
 
     Args:
-        **how: speed, turn and offset, as for `Cars.place`.
+        env: from `make_env`, fast or not.
+        tile, speed, turn, offset: as for `Cars.place`.
     """
-    return env.unwrapped.place(tile, **how)
+    racing = env.unwrapped
+    if isinstance(racing, CarRacing):
+        return racing.place(tile, speed=speed, turn=turn, offset=offset)
+    _, beta, x, y = racing.track[tile % len(racing.track)]
+    heading, across = beta + turn, offset * TRACK_WIDTH
+    racing.car.destroy()
+    place = x + across * np.cos(beta), y + across * np.sin(beta)
+    racing.car = car_dynamics.Car(racing.world, heading, *place)
+    for wheel, (left, ahead) in zip(racing.car.wheels, car_dynamics.WHEELPOS, strict=True):
+        # Gymnasium places the wheels as if the car faced north.
+        corner = left * car_dynamics.SIZE, ahead * car_dynamics.SIZE
+        wheel.position = racing.car.hull.GetWorldPoint(corner)
+        wheel.omega = speed / wheel.wheel_rad
+    for body in racing.car.drawlist:
+        body.linearVelocity = (-np.sin(heading) * speed, np.cos(heading) * speed)
+    racing.t = max(racing.t, 1.0)  # the opening zoom is over
+    return racing._render("state_pixels")
 
 
 def spaces(continuous: bool = True) -> tuple[gym.Space, gym.Space]:
