@@ -176,25 +176,6 @@ def test_a_checkpoint_that_a_killed_process_left_behind_is_cleared_away(
         assert not left_over.exists()
 
 
-def test_training_leaves_torch_s_own_settings_alone_and_does_not_depend_on_them(
-    data, quick_run, tmp_path
-):
-    torch.manual_seed(1)
-    state, config = torch.get_rng_state(), QUICK.replace(vae={"steps": 2})
-    train_vae(config, data, tmp_path / "first")
-    assert torch.equal(torch.get_rng_state(), state)
-    torch.manual_seed(2)
-    torch.set_default_dtype(torch.float64)
-    try:
-        with torch.no_grad():
-            train_vae(config, data, tmp_path / "second")
-        assert torch.get_default_dtype() == torch.float64
-    finally:
-        torch.set_default_dtype(torch.float32)
-    files = [tmp_path / name / "vae.safetensors" for name in ("first", "second")]
-    assert files[0].read_bytes() == files[1].read_bytes()
-
-
 def test_no_steps_leave_m_with_its_initial_weights(data, run_with_v, monkeypatch):
     config, folder = QUICK.replace(mdn_rnn={"steps": 0}), run_with_v("run")
     monkeypatch.setattr(training_of_m, "encode_dataset", None)  # V need not encode anything
