@@ -276,8 +276,8 @@ def load_agent(source: str | Path) -> Agent:
 
     Args:
         source: "frame", "input", "output" or "input_output" for the shipped agents, which are of
-            one recipe and differ in their variant alone; the name of another shipped agent; or the
-            folder of a run. A folder with such a name is given as a Path.
+            one recipe (but the second iteration of "input" replayed no hard tracks); the name of
+            another shipped agent; or the folder of a run. Give a folder of such a name as a Path.
 
     Raises:
         FileNotFoundError: no such agent, or its run is not finished.
@@ -289,8 +289,8 @@ def load_agent(source: str | Path) -> Agent:
             f"{str(source)!r} is no trained agent: expected {', '.join(shipped_agents())}, or the"
             " folder of a finished run of `python -m stad_lab train`"
         )
-    world_model = load_world_model(folder)
     parameters, metadata = load_controller(folder / CONTROLLER_FILE)
+    world_model = load_world_model(folder)
     agent = Agent(world_model, parameters)
     check_belongs(folder / CONTROLLER_FILE, metadata, **world_model.checksums)
     return agent

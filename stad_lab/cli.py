@@ -20,6 +20,8 @@ from stad_lab.config import PRESETS, Config
 
 CONTINUES = ("train", "fine-tune", "evaluate", "replicate", "latents")  # after an interrupt
 PROGRAM = "python -m stad_lab"
+# Packages that a few commands need, and the extras that bring them.
+EXTRAS = {"matplotlib": "lab", "PIL": "lab", "distributed": "cluster", "envpool": "benchmark"}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -85,7 +87,7 @@ def take_preset(arguments: list[str]) -> tuple[str | None, list[str]]:
 
 def one_line(message: str) -> str:
     """The parser's message without its frame, and without its advice on --help."""
-    lines = [re.sub(r"[─│╭╮╰╯]+", "", line).strip() for line in message.splitlines()]
+    lines = [re.sub(r"[─│╭╮╰╯]+|-{9,}", "", line).strip() for line in message.splitlines()]
     kept = [line for line in lines if line and line.lower() != "error"]
     text = " ".join(kept).partition("Argument helptext")[0].partition("For full helptext")[0]
     return re.sub(
@@ -97,6 +99,8 @@ def explain(error: Exception) -> str | None:
     """One line for an error of the user or of the machine; None for a fault of ours."""
     if isinstance(error, MemoryError | OverflowError) or is_out_of_memory(error):
         return f"too large for this machine: {error or type(error).__name__}"
+    if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
+        return f"{error}: pip install 'stad_lab[{EXTRAS[error.name]}]'"
     known = ValueError, OSError, FloatingPointError, ImportError
     if isinstance(error, known) or type(error).__name__ == "TaskError":
         return str(error)
@@ -105,7 +109,7 @@ def explain(error: Exception) -> str | None:
 
 def is_out_of_memory(error: Exception) -> bool:
     """Whether a RuntimeError says that memory is short: PyTorch has no error of its own."""
-    short = ("allocate memory", "could not create a primitive")
+    short = ("out of memory", "allocate memory", "could not create a primitive")
     return isinstance(error, RuntimeError) and any(words in str(error) for words in short)
 
 
@@ -239,8 +243,8 @@ def evaluate(
     other += f"-{episodes}-tracks" * (episodes != 100)
     file = json or result_folder(agent) / f"evaluation-{run_folder(agent).name}{other}.json"
     load_agent(agent)
-    check_output(file)
     check_writable(file)
+    check_output(file)
     unfinished = file.with_name(f"unfinished-{file.name}")
     with cluster_of(scheduler) as executor:
         result = evaluate(agent, episodes, first_track, fast, processes, executor, unfinished)
@@ -296,13 +300,14 @@ def replicate(
     """
     from stad_lab.replication import run
 
+    folder = output(out)
     if keep:
-        kept = run.keep(experiment, output(out), seeds)
+        kept = run.keep(experiment, folder, seeds)
         print("\n".join(f"kept {name}" for name in kept) or "no seed is finished")
         return
     with cluster_of(scheduler) as executor:
         print(run.describe_time(experiment, run.time_needed(experiment, seeds)), flush=True)
-        print(run.describe(experiment, run.replicate(experiment, output(out), executor, seeds)))
+        print(run.describe(experiment, run.replicate(experiment, folder, executor, seeds)))
 
 
 def claims() -> None:
@@ -331,8 +336,8 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
 
     file = json or result_folder(run) / f"probe-{run_folder(run).name}.json"
     load_world_model(run_folder(run))
-    check_output(file)
     check_writable(file)
+    check_output(file)
     found = probe_run(run, episodes, processes)
     print(describe_probe(found), flush=True)
     save_json(file, found)
@@ -411,14 +416,15 @@ def film(
         first: First frame shown; 60 is after the opening zoom.
         frames: Frames covered; every third is shown.
     """
+    file = output(out)
+    kind = file.suffix.lstrip(".").lower()
+    if kind not in ("gif", "webp") or (kind == "webp" and not viewer):
+        raise ValueError(f"--out {file}: expected a .gif (or, with --viewer, a .webp)")
     from stad_lab.agent import load_agent
     from stad_lab.io.files import check_writable, write_bytes
     from stad_lab.viz.video import film_agent, film_viewer
 
-    file, loaded = output(out), load_agent(agent)
-    kind = file.suffix.lstrip(".").lower()
-    if kind not in ("gif", "webp") or (kind == "webp" and not viewer):
-        raise ValueError(f"--out {file}: expected a .gif (or, with --viewer, a .webp)")
+    loaded = load_agent(agent)
     check_writable(file)
     shown = (loaded, track, first, frames)
     write_bytes(file, film_viewer(*shown, kind=kind) if viewer else film_agent(*shown))

@@ -289,19 +289,28 @@ def check_variant(variant: str) -> None:
         raise ValueError(f"unknown variant {variant!r}: choose one of {', '.join(VARIANTS)}")
 
 
-def check_same(path: Path, was: dict, now: dict, prefix: str = "") -> None:
+def check_same(path: Path, was: dict, now: dict) -> None:
     """Raise ValueError if what is in `path` was made with other values than `now` asks for.
 
-    Both are nested dicts. A value that `was` lacks did not exist then and counts as equal.
+    Both are nested dicts. A setting that `was` lacks did not exist then: it counts as its default.
     """
+    then, now, defaults = flatten(was), flatten(now), flatten(Config().as_dict())
     for name, value in now.items():
-        if isinstance(value, dict) and isinstance(was.get(name), dict):
-            check_same(path, was[name], value, f"{prefix}{name}.")
-        elif name in was and was[name] != value:
+        before = then.get(name, defaults.get(name))
+        if before != value:
             raise ValueError(
-                f"{path} was made with {prefix}{name}={was[name]!r}, now {prefix}{name}={value!r}"
-                " is asked for: choose another folder, or the same settings"
+                f"{path} was made with {name}={before!r}, now {name}={value!r} is asked for:"
+                " choose another folder, or the same settings"
             )
+
+
+def flatten(values: dict, prefix: str = "") -> dict:
+    """A nested dict as a flat one with dotted names."""
+    flat = {}
+    for name, value in values.items():
+        nested = isinstance(value, dict)
+        flat |= flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
+    return flat
 
 
 # The purposes that random numbers are drawn for. Each has its own stream; append, never reorder.

@@ -42,17 +42,20 @@ def run_stad_lab(*arguments, **environment):
     )
 
 
-# Python runs a module of this name at every start, so this watches the command and all of its workers.
+# Python runs a module named sitecustomize at every start, so this watches the command and all of
+# its workers: they may write to the folders in GUARDED alone, and use no network.
 GUARD = """
 import os, sys
+
+PATHS = ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate")
 
 def guard(event, arguments):
     if event == "socket.getaddrinfo":
         forbid(f"{event} {arguments}")
-    if event in ("socket.connect", "socket.bind") and not isinstance(arguments[1], str):  # a path: within the machine
-        forbid(f"{event} {arguments}")
-    if event in ("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate"):
-        for where in arguments:  # one path or two; a bare name lies in a folder that is open, of a tree that goes
+    if event in ("socket.connect", "socket.bind") and not isinstance(arguments[1], str):
+        forbid(f"{event} {arguments}")  # a str is the path of a socket within the machine
+    if event in PATHS:
+        for where in arguments:  # a bare name lies in a folder that is open
             if isinstance(where, str) and os.path.isabs(where):
                 check(where)
     if event == "open" and isinstance(arguments[0], str) and arguments[2] is not None:
@@ -80,12 +83,10 @@ def command_line():
 
 @pytest.fixture(scope="session")
 def quick_training(tmp_path_factory, worker_id):
-    """One run made by the real command: (its folder, the finished process, its duration in seconds)."""
+    """One run made by the real command: (its folder, the finished process, seconds)."""
     shared = tmp_path_factory.getbasetemp()
     if worker_id != "master":
-        shared = (
-            shared.parent
-        )  # of all processes of this test run: whoever comes first makes the run
+        shared = shared.parent  # all processes of this test run share the run
     told = shared / "quick_training.json"
     with FileLock(shared / "quick_training.lock"):
         if not told.exists():
@@ -98,23 +99,18 @@ def quick_training(tmp_path_factory, worker_id):
 
 
 def train_quickly(folder, guard):
-    """Train with the quick settings under guard: what came of it, as a dictionary."""
+    """Train with the quick preset under guard; returns what came of it."""
     guard.mkdir()
     (guard / "sitecustomize.py").write_text(GUARD)
-    # PyTorch looks for a place for temporary files: in /dev/ and /proc/, too
-    may_write = os.pathsep.join([str(folder), str(guard), "/dev/", "/proc/"])
     guarded = {
-        "GUARDED": may_write,
+        # PyTorch looks for a place for temporary files in /dev/ and /proc/, too.
+        "GUARDED": os.pathsep.join([str(folder), str(guard), "/dev/", "/proc/"]),
         "TMPDIR": str(guard),
-        "PYTHONPATH": str(guard),
+        "PYTHONPATH": os.pathsep.join([str(guard), os.environ.get("PYTHONPATH", "")]),
         "PYTHONDONTWRITEBYTECODE": "1",
+        "MPLCONFIGDIR": str(guard),  # matplotlib, which pycma imports, makes a folder
+        "TORCHINDUCTOR_CACHE_DIR": str(guard),  # PyTorch hands that of this process on
     }
-    guarded["MPLCONFIGDIR"] = str(
-        guard
-    )  # matplotlib, which pycma imports, makes a folder for its own settings
-    guarded["TORCHINDUCTOR_CACHE_DIR"] = str(
-        guard
-    )  # a PyTorch that has trained in this process hands its own on
     begin = time.perf_counter()
     command = ("train", "quick", "--variant", "input_output", "--out", folder)
     process = run_stad_lab(*command, **guarded)
@@ -130,7 +126,10 @@ def quick_run(quick_training):
 
 @pytest.fixture(scope="session")
 def straight_run(quick_run, tmp_path_factory):
-    """The run with a C whose sight reaches the gas alone: it goes straight on, and off the field in some 300 frames."""
+    """The run with a C that uses z and h for the gas alone.
+
+    It drives straight on, and leaves the field after some 300 frames.
+    """
     folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("runs") / "straight")
     _, metadata = load_controller(folder / CONTROLLER_FILE)
     quick = Config.preset("quick")
@@ -150,7 +149,7 @@ def agent(quick_run):
 
 @pytest.fixture(scope="session")
 def observations():
-    """Sixty observations of one drive: a list of uint8 (96, 96, 3)."""
+    """Sixty observations of one episode: a list of uint8 (96, 96, 3)."""
     env = make_env()
     seen = [env.reset(seed=7)[0]]
     env.action_space.seed(7)
@@ -162,7 +161,7 @@ def observations():
 
 @pytest.fixture(scope="session")
 def noted_tracks():
-    """with noted_tracks() as tracks: the seeds with which cars are set on a track in this process go into the list."""
+    """`with noted_tracks() as tracks:` lists the tracks on which this process resets a car."""
 
     @contextmanager
     def note():
@@ -181,7 +180,10 @@ def noted_tracks():
 
 @pytest.fixture
 def interrupt_after():
-    """interrupt_after(n) raises KeyboardInterrupt after n more updates of a training; returns a handle to remove()."""
+    """A function that raises KeyboardInterrupt after so many updates of a training.
+
+    It returns a handle with a method `remove`.
+    """
     handles = []
 
     def interrupt(updates):

@@ -1,142 +1,181 @@
-"""The settings: three presets, and a clear error for everything that is wrong."""
+"""The configuration: three presets, and a clear error for every wrong value."""
 
 import dataclasses
 import inspect
+import itertools
 
+import numpy as np
 import pytest
 
-from stad_lab import Settings
-from stad_lab.config import PRESETS
+from stad_lab import Config
+from stad_lab.config import (
+    PRESETS,
+    TRACK_RANGES,
+    DataConfig,
+    EvolutionConfig,
+    MDNRNNConfig,
+    VAEConfig,
+    check_same,
+    random_stream,
+    track_seeds,
+)
 
 
-def test_there_are_three_presets():
-    assert list(PRESETS) == ["quick", "laptop", "paper"]
-    for name in PRESETS:
-        assert Settings.preset(name).name == name
-
-
-def test_the_paper_preset_is_the_paper_s_budget():
-    paper = Settings.preset("paper")
-    assert (paper.episodes, paper.episode_frames, paper.stride) == (1000, 1000, 4)
-    assert (paper.generations, paper.population) == (600, 8)
-    assert (paper.latent_size, paper.hidden_size, paper.mixtures) == (32, 256, 5)
-    assert paper.max_frames == 1000
-    assert paper.patience == 0  # no episode is given up
+def test_the_paper_preset_is_the_budget_of_the_paper():
+    paper = Config.preset("paper")
+    assert (paper.data.episodes, paper.data.episode_frames, paper.vae.stride) == (1000, 1000, 4)
+    assert (paper.evolution.generations, paper.evolution.population) == (600, 8)
+    assert (paper.vae.latent_size, paper.mdn_rnn.hidden_size, paper.mdn_rnn.mixtures) == (
+        32,
+        256,
+        5,
+    )
+    assert (paper.evolution.max_frames, paper.evolution.patience) == (1000, 0)
 
 
 def test_the_environment_variable_names_the_preset(monkeypatch):
-    monkeypatch.setenv("STAD_LAB_SETTINGS", "paper")
-    assert Settings.preset() == PRESETS["paper"]
-    assert Settings.preset("quick") == PRESETS["quick"]
-    monkeypatch.delenv("STAD_LAB_SETTINGS")
-    assert Settings.preset() == PRESETS["laptop"] == Settings()
+    monkeypatch.setenv("STAD_LAB_PRESET", "paper")
+    assert Config.preset() == PRESETS["paper"]
+    assert Config.preset("quick") == PRESETS["quick"]
+    monkeypatch.delenv("STAD_LAB_PRESET")
+    assert Config.preset() == PRESETS["laptop"] == Config()
 
 
-def test_a_wrong_environment_variable_is_an_error(monkeypatch):
-    monkeypatch.setenv("STAD_LAB_SETTINGS", "huge")
-    with pytest.raises(
-        ValueError, match="unknown settings 'huge': choose one of quick, laptop, paper"
-    ):
-        Settings.preset()
+def test_an_unknown_preset_is_refused_with_the_choices(monkeypatch):
+    with pytest.raises(ValueError, match="'fast': choose one of quick, laptop, paper"):
+        Config.preset("fast")
+    monkeypatch.setenv("STAD_LAB_PRESET", "huge")
+    with pytest.raises(ValueError, match="'huge': choose one of quick, laptop, paper"):
+        Config.preset()
 
 
-def test_a_preset_can_be_changed():
-    assert Settings.preset("quick", stride=2) == dataclasses.replace(PRESETS["quick"], stride=2)
-    assert PRESETS["quick"].stride == 4
+def test_a_copy_with_other_values_leaves_the_preset_as_it_is():
+    changed = Config.preset("quick", seed=1, vae={"stride": 2})
+    assert (changed.seed, changed.vae.stride) == (1, 2)
+    assert changed.replace(seed=0, vae={"stride": 4}) == PRESETS["quick"]
+    assert PRESETS["quick"].vae.stride == 4
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        changed.vae.stride = 3
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_settings_survive_the_way_through_a_dict(name):
-    assert Settings.from_dict(PRESETS[name].as_dict()) == PRESETS[name]
+def test_a_config_survives_the_way_through_a_dict(name):
+    assert Config.from_dict(PRESETS[name].as_dict()) == PRESETS[name]
 
 
-def test_settings_cannot_be_changed_by_accident():
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        Settings().stride = 3
-
-
-def test_an_unknown_preset_is_refused_with_the_choices():
-    with pytest.raises(
-        ValueError, match="unknown settings 'fast': choose one of quick, laptop, paper"
-    ):
-        Settings.preset("fast")
-
-
-def test_a_preset_keeps_its_name():
-    with pytest.raises(
-        ValueError,
-        match="name='laptop' of the settings 'quick': the name cannot be set; choose a preset with",
-    ):
-        Settings.preset("quick", name="laptop")
+def test_a_field_that_an_older_run_does_not_have_takes_its_default():
+    older = PRESETS["quick"].as_dict()
+    del older["evolution"]["replay_share"]
+    assert Config.from_dict(older) == PRESETS["quick"]
 
 
 @pytest.mark.parametrize(
-    "make", [lambda: Settings.preset("quick", strid=2), lambda: Settings.from_dict({"strid": 2})]
+    "make",
+    [
+        lambda: Config.preset("quick", vae={"strid": 2}),
+        lambda: Config.from_dict({"vae": {"strid": 2}}),
+    ],
 )
 def test_an_unknown_field_is_refused_with_the_choices(make):
-    with pytest.raises(
-        ValueError, match=r"unknown setting 'strid': the settings are name, seed, .*stride"
-    ):
+    with pytest.raises(ValueError, match=r"unknown setting 'strid': expected one of .*stride"):
         make()
 
 
 @pytest.mark.parametrize(
     ("field", "value", "expected"),
     [
-        ("stride", 0, "expected 1 to"),
-        ("stride", 2.5, "expected int"),
-        ("stride", True, "expected int"),
-        ("stride", "4", "expected int"),
-        ("crop_bar", 1, "expected bool"),
-        ("sigma", 0.0, "expected 1e-12 to"),
-        ("sigma", "big", "expected float"),
-        ("kl_weight", -0.1, "expected 0 to"),
-        ("kl_weight", 10**400, "expected 0 to"),
-        ("kl_weight", float("nan"), "expected 0 to"),
-        ("initial_gas", float("nan"), "expected"),
-        ("v_learning_rate", float("inf"), "expected 1e-12 to"),
-        ("random_starts", 1.5, "expected 0 to 1"),
-        ("population", 3, "expected 4 to"),
+        ("variant", "both", "choose one of 'frame', 'input', 'output', 'input_output'"),
+        ("evolution.features", "x", "choose one of 'z, h', 'z', 'h'"),
+        ("evolution.step_size_rule", "MSR", "choose one of 'CSA', 'TPA'"),
+        ("vae.stride", 0, "expected 1 to"),
+        ("vae.stride", 2.5, "expected int"),
+        ("vae.stride", True, "expected int"),
+        ("vae.stride", "4", "expected int"),
+        ("data.crop_bar", 1, "expected bool"),
+        ("evolution.sigma", 0.0, "expected 1e-12 to"),
+        ("evolution.sigma", "big", "expected float"),
+        ("vae.kl_weight", -0.1, "expected 0 to"),
+        ("vae.kl_weight", 10**400, "expected 0 to"),
+        ("vae.kl_weight", float("nan"), "expected 0 to"),
+        ("evolution.initial_gas", float("nan"), "expected"),
+        ("vae.learning_rate", float("inf"), "expected 1e-12 to"),
+        ("data.random_starts", 1.5, "expected 0 to 1"),
+        ("evolution.population", 3, "expected 4 to"),
+        ("evolution.patience", -1, "expected 0 to"),
         ("processes", 0, "expected 1 to"),
-        ("episodes", 1, "expected 2 to"),  # one to train on, one held out
+        ("data.episodes", 1, "expected 2 to"),  # one to train on, one held out
         ("seed", None, "expected int"),
-        ("episode_frames", 1500, "expected 1 to 1000"),  # CarRacing ends an episode then
-        ("max_frames", 1001, "expected 1 to 1000"),
+        ("data.episode_frames", 1500, "expected 1 to 1000"),  # CarRacing ends an episode then
+        ("evolution.max_frames", 1001, "expected 1 to 1000"),
         ("processes", 10**9, "expected 1 to 10000"),
-        ("width", 10**6, "expected 1 to 1000"),
-        ("episodes", 10**12, r"expected 2 to 1e\+06"),
-        ("name", "mine", "expected the preset"),
+        ("vae.width", 10**6, "expected 1 to 1000"),
+        ("data.episodes", 10**12, r"expected 2 to 1e\+06"),
+        ("vae", 3, "expected a VAEConfig or a dict of it"),
     ],
 )
 def test_a_wrong_value_is_refused_with_its_name_and_what_was_expected(field, value, expected):
+    stage, _, name = field.rpartition(".")
     with pytest.raises(ValueError, match=expected) as error:
-        Settings(**{field: value})
+        Config().replace(**{stage: {name: value}} if stage else {name: value})
     assert f"{field}={value!r}" in str(error.value)
 
 
-def test_values_that_do_not_go_together_are_refused():
-    with pytest.raises(
-        ValueError, match=r"m_sequence=100 does not fit .*episode_frames=80: use at most 79"
-    ):
-        Settings(episode_frames=80)
-    with pytest.raises(
-        ValueError, match=r"episode_frames=20, but with stride=30 .*use more than 30 frames"
-    ):
-        Settings(episode_frames=20, stride=30, m_sequence=5)
-    with pytest.raises(
-        ValueError, match=r"generations=54 is not a multiple of validate_every=5: the last"
-    ):
-        Settings(generations=54)
-    with pytest.raises(
-        ValueError,
-        match=r"sigma_decay=0\.5 shrinks sigma=.* in 55 generations: use .* nearer to 1, or 0",
-    ):
-        Settings(sigma_decay=0.5)
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"data": {"episode_frames": 80}},
+            r"mdn_rnn.sequence=100 does not fit .*data.episode_frames=80: use at most 79",
+        ),
+        (
+            {"data": {"episode_frames": 20}, "vae": {"stride": 30}, "mdn_rnn": {"sequence": 5}},
+            r"data.episode_frames=20: expected more than vae.stride=30",
+        ),
+        (
+            {"evolution": {"generations": 54}},
+            r"generations=54 is not a multiple of evolution.validate_every=5",
+        ),
+        (
+            {"evolution": {"sigma_decay": 0.5}},
+            r"sigma_decay=0\.5 shrinks sigma=.* in 55 generations: use .* nearer to 1,\s+or 0",
+        ),
+    ],
+)
+def test_values_that_do_not_fit_together_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        Config().replace(**changes)
 
 
-def test_every_setting_has_its_sentence():
-    source = inspect.getsource(Settings)
-    for field in dataclasses.fields(Settings):
-        following = source.split(f"    {field.name}: ")[1].split("\n", 2)[1].strip()
-        assert following.startswith('"""'), field.name
-        assert following.endswith('."""'), field.name
+@pytest.mark.parametrize("kind", [Config, DataConfig, VAEConfig, MDNRNNConfig, EvolutionConfig])
+def test_every_field_has_a_sentence_of_help(kind):
+    source = inspect.getsource(kind)
+    for field in dataclasses.fields(kind):
+        if not dataclasses.is_dataclass(field.type):
+            following = source.split(f"    {field.name}: ")[1].split("\n", 2)[1].strip()
+            assert following.startswith('"""'), field.name
+            assert following.endswith('."""'), field.name
+
+
+def test_another_value_is_refused_and_one_that_did_not_exist_counts_as_its_default(tmp_path):
+    older = {"seed": 0, "vae": {"stride": 4}}
+    check_same(tmp_path, older, {"vae": {"stride": 4, "free_bits": 0.0}})
+    for now, message in (
+        ({"vae": {"stride": 2}}, r"made with vae\.stride=4, now vae\.stride=2 is asked"),
+        ({"vae": {"free_bits": 0.5}}, r"made with vae\.free_bits=0\.0, now vae\.free_bits=0\.5"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            check_same(tmp_path, older, now)
+
+
+def test_random_streams_do_not_collide():
+    streams = [("vae", 0), ("vae", 0, 0), ("vae", 0, 1), ("vae", 1), ("mdn_rnn", 0), ("init", 0, 1)]
+    first = [random_stream(*stream).integers(2**63) for stream in streams]
+    assert len(set(first)) == len(streams)
+    assert np.array_equal(first, [random_stream(*stream).integers(2**63) for stream in streams])
+
+
+def test_no_two_uses_share_a_track():
+    bounds = sorted(TRACK_RANGES.values())
+    assert all(high <= low for (_, high), (low, _) in itertools.pairwise(bounds))
+    for use, (low, high) in TRACK_RANGES.items():
+        assert all(low <= track < high for track in track_seeds(use, 100, seed=3))

@@ -1,4 +1,4 @@
-"""Tasks that end badly. They lie apart, for a worker imports the module of its task, and this one takes no time."""
+"""Tasks that end badly, in a module that a worker imports in no time."""
 
 import os
 import signal
@@ -15,14 +15,18 @@ def die_once(marker, answer):
     return answer
 
 
-def hang_once(marker, answer):
-    """A task whose first worker never ends."""
-    if not marker.exists():
-        marker.touch()
-        time.sleep(10_000)
-    return answer
-
-
 def always_die():
     """A task that no worker survives."""
     os.kill(os.getpid(), KILL)
+
+
+def note(folder, number):
+    """A task that leaves a file when it begins, and takes a while."""
+    (folder / str(number)).touch()
+    time.sleep(0.2)
+    return number
+
+
+def send_much():
+    """A task whose result takes long on its way to the parent."""
+    return bytes(300_000_000)

@@ -148,8 +148,8 @@ def verify_log(folder: Path, config: Config) -> str:
 
 def verify_controller(folder: Path, config: Config) -> str:
     """Check that C is the one with the best validation in the log, and that this is the best."""
-    if lacks(folder, LOG, CONTROLLER_FILE):
-        return MISSING
+    if not all((folder / name).exists() for name in (LOG, CONTROLLER_FILE)):
+        return MISSING  # but a C that has lost its V or M fails below
     log = read_log(longest(folder, config), folder, load_world_model(folder))
     validated = [entry for entry in log["generations"] if "validation" in entry]
     best = max(validated, key=lambda entry: entry["validation"]["mean"], default=None)
@@ -170,8 +170,9 @@ def verify_evaluations(folder: Path) -> str:
     """Check the evaluations in the folder, and that they are of this C."""
     files = sorted(folder.glob("evaluation*.json"))
     for file in files:
-        parameters, _ = load_controller(folder / CONTROLLER_FILE)
-        if load_evaluation(file)["controller"] != checksum_of_arrays(parameters=parameters):
+        parameters, metadata = load_controller(folder / CONTROLLER_FILE)
+        found, drove = load_evaluation(file), checksum_of_arrays(parameters=parameters)
+        if (found["controller"], found["variant"]) != (drove, metadata["variant"]):
             raise ValueError(f"{file} is of another controller: evaluate again")
     return f"ok: {', '.join(file.name for file in files)}" if files else "none: not evaluated here"
 

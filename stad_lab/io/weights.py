@@ -50,6 +50,7 @@ def save_vae(
     save_tensors(path, vae.state_dict(), **described("vae", vae.state_dict()), **metadata)
 
 
+@torch.random.fork_rng([])  # a new module draws weights, which are replaced
 def load_vae(path: Path) -> tuple[VAE, dict]:
     """Read V: (the VAE in evaluation mode, its metadata).
 
@@ -74,6 +75,7 @@ def save_mdn_rnn(
     save_tensors(path, weights, **described("mdn_rnn", weights), **metadata)
 
 
+@torch.random.fork_rng([])
 def load_mdn_rnn(path: Path) -> tuple[MDNRNN, dict]:
     """Read M: (the MDN-RNN in evaluation mode, its metadata). Raises as `load_vae`."""
     tensors, metadata = load_kind(path, "mdn_rnn", "latent_size", "mdn_rnn", "vae", "weights")

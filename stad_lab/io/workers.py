@@ -56,7 +56,6 @@ class WorkerProcesses(Executor):
         if count < 1:
             raise ValueError(f"processes={count}: expected at least 1, such as the number of cores")
         self.count, self.losses, self.closed = count, 0, False
-        self.others = set(multiprocessing.active_children())
         self.lock = threading.RLock()
         self.pool = self._new_pool()
         self.lost: list[ProcessPoolExecutor] = []  # referenced: dropping a broken one can deadlock
@@ -64,8 +63,7 @@ class WorkerProcesses(Executor):
     def submit(self, function: Callable, /, *arguments, **named) -> Future:
         """As for every Executor."""
         task = Future()
-        work = functools.partial(run_here, stad_lab.__file__, function, *arguments, **named)
-        self._begin(task, work)
+        self._begin(task, Work(task, functools.partial(function, *arguments, **named)))
         return task
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -76,9 +74,12 @@ class WorkerProcesses(Executor):
     def stop(self) -> None:
         """End the processes at once."""
         self.closed = True
-        for process in set(multiprocessing.active_children()) - self.others:
+        for process in list((self.pool._processes or {}).values()):  # there is no public name
             process.kill()
-        self.shutdown(wait=False, cancel_futures=True)
+        # A worker that dies while it sends a result leaves half of it, and the pool waits for the
+        # rest as long as anybody could write it: forever, because this process could.
+        if results := self.pool._result_queue:
+            results._writer.close()
 
     def _new_pool(self) -> ProcessPoolExecutor:
         # Not "fork": copies of this process would lack PyTorch's threads.
@@ -88,9 +89,7 @@ class WorkerProcesses(Executor):
         count = min(self.count, 61) if sys.platform == "win32" else self.count  # Windows' limit
         return ProcessPoolExecutor(count, mp_context=context, initializer=start_worker)
 
-    def _begin(self, task: Future, work: Callable) -> None:
-        if task.cancelled():
-            return
+    def _begin(self, task: Future, work: "Work") -> None:
         pool = self.pool
         try:
             attempt = pool.submit(work)
@@ -98,19 +97,19 @@ class WorkerProcesses(Executor):
             attempt = Future()
             attempt.set_exception(error)
         attempt.add_done_callback(functools.partial(self._end, task, work, pool))
-        task.add_done_callback(lambda done: done.cancelled() and attempt.cancel())
 
-    def _end(
-        self, task: Future, work: Callable, pool: ProcessPoolExecutor, attempt: Future
-    ) -> None:
+    def _end(self, task: Future, work: "Work", pool: ProcessPoolExecutor, attempt: Future) -> None:
         if attempt.cancelled():
             task.cancel()
-            return
-        error = attempt.exception()
-        if isinstance(error, BrokenProcessPool) and not self.closed and self._replace(pool):
-            self._begin(task, work)
-            return
-        if not task.set_running_or_notify_cancel():
+        error = None if task.cancelled() else attempt.exception()
+        if isinstance(error, BrokenProcessPool) and not self.closed:
+            try:
+                if self._replace(pool):
+                    self._begin(task, work)
+                    return
+            except OSError as failure:  # no process can be started
+                error = failure
+        if not task.set_running_or_notify_cancel():  # tells those who wait for a cancelled task
             return
         if error is None:
             self.losses = 0
@@ -141,14 +140,28 @@ def check_script() -> None:
         )
 
 
-def run_here(home: str, function: Callable, *arguments, **named) -> object:
+class Work:
+    """What a worker does for a task: nothing if the task is cancelled before it is sent.
+
+    To cancel the pool's own future instead would stop a pool that breaks from ending (Python 3.11).
+    """
+
+    def __init__(self, task: Future, call: Callable):
+        self.task, self.call = task, call
+
+    def __reduce__(self):
+        sent = (int,) if self.task.cancelled() else (run_here, stad_lab.__file__, self.call)
+        return functools.partial, sent
+
+
+def run_here(home: str, call: Callable) -> object:
     """Call a function in a worker, which must have loaded the same stad_lab as its parent."""
     if stad_lab.__file__ != home:
         raise ValueError(
             f"a worker process loaded {stad_lab.__file__}, its parent {home}: install the one that"
             " you use instead of changing sys.path"
         )
-    return function(*arguments, **named)
+    return call()
 
 
 @contextmanager

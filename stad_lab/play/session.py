@@ -5,15 +5,16 @@ test). On the real track the agent sees every frame and M remembers every action
 human drives. So the agent can take over at any frame, and a dream can begin at any frame.
 """
 
-import functools
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from stad_lab.agent import Agent
+from stad_lab.config import TRACK_RANGES
 from stad_lab.dreaming import Dreamer
 from stad_lab.envs.car_racing import make_env
 from stad_lab.envs.dream import DreamEnv
@@ -24,22 +25,18 @@ PEDALS = ("left", "right", "gas", "brake")
 FULL = np.array([1.0, 0.7, 0.8])  # steering, gas and brake of a key held for long
 PRESS = np.array([0.08, 0.04, 0.1])  # change of each in a frame, towards a held key's value
 RELEASE = np.array([0.16, 0.08, 0.4])  # and back, after its release
-LAST_TRACK = 999_999  # of the tracks that nothing is trained on
+LAST_TRACK = TRACK_RANGES["test"][1] - 1  # of the tracks that nothing is trained on
 
 
-def on_one_thread(method: Callable) -> Callable:
-    """Run a method with PyTorch on one thread: for a single frame, more threads cost time."""
-
-    @functools.wraps(method)
-    def run(*arguments):
-        threads = torch.get_num_threads()
-        torch.set_num_threads(1)
-        try:
-            return method(*arguments)
-        finally:
-            torch.set_num_threads(threads)
-
-    return run
+@contextmanager
+def on_one_thread() -> Iterator[None]:
+    """PyTorch on one thread: for a single frame, more threads cost time."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class Hand:
@@ -74,16 +71,12 @@ class Hand:
 
 @dataclass(frozen=True)
 class DreamTrajectory:
-    """What was driven in the dream: T frames; row t is the moment when `frames[t]` is seen."""
+    """T frames of a dream: what V decodes, z, the action on it, and whether the human drove."""
 
-    frames: np.ndarray
-    """What V decodes from z: uint8 (T, 64, 64, 3)."""
-    latents: np.ndarray
-    """z: float32 (T, latent_size)."""
-    actions: np.ndarray
-    """float32 (T, 3)."""
-    by_hand: np.ndarray
-    """Whether the human drove: bool (T,)."""
+    frames: np.ndarray  # uint8 (T, 64, 64, 3)
+    latents: np.ndarray  # float32 (T, latent_size)
+    actions: np.ndarray  # float32 (T, 3)
+    by_hand: np.ndarray  # bool (T,)
 
 
 class Session:
@@ -112,13 +105,9 @@ class Session:
         self.rows: list[tuple] = []
         self.begin(track)
 
-    @on_one_thread
+    @on_one_thread()
     def begin(self, track: int) -> None:
-        """Begin an episode on a real track; the one before is kept in `earlier`.
-
-        Raises:
-            ValueError: a track that is not a whole number from 0 to 999,999.
-        """
+        """Begin an episode on a real track (ValueError for others than 0 to 999,999)."""
         if not isinstance(track, int | np.integer) or not 0 <= track <= LAST_TRACK:
             raise ValueError(f"track={track!r}: expected a whole number from 0 to {LAST_TRACK:,}")
         if self.rows:
@@ -137,22 +126,14 @@ class Session:
         return self.real_ended if self.world == "real" else self.dream_ended
 
     def give(self, driver: str) -> None:
-        """Let "hand" or "agent" drive; a hand begins with the agent's last action.
-
-        Raises:
-            ValueError: another driver.
-        """
+        """Let "hand" or "agent" drive (ValueError for others), from the last action on."""
         if driver not in DRIVERS:
             raise ValueError(f"driver {driver!r}: expected one of {', '.join(DRIVERS)}")
         self.driver = driver
 
-    @on_one_thread
+    @on_one_thread()
     def enter(self, world: str) -> None:
-        """Continue on the "real" track where it stands, or in a new "dream" of its present frame.
-
-        Raises:
-            ValueError: another world.
-        """
+        """Continue on the "real" track, or in a new "dream" of its frame; else ValueError."""
         if world not in WORLDS:
             raise ValueError(f"world {world!r}: expected one of {', '.join(WORLDS)}")
         if world == "dream":
@@ -161,17 +142,15 @@ class Session:
             self.dream_rows, self.dream_ended = [], False
         self.world = world
 
-    @on_one_thread
+    @on_one_thread()
     def step(self) -> None:
         """Drive one frame in the present world. RuntimeError if its episode has ended."""
         if self.ended:
-            raise RuntimeError(
-                "the episode has ended: begin(track) another, or enter(world) the other world"
-            )
+            raise RuntimeError("the episode has ended: begin(track), or enter the other world")
         driver = self.driver  # read once: another thread may call `give`
         (self._step_real if self.world == "real" else self._step_dream)(driver)
 
-    @on_one_thread
+    @on_one_thread()
     def picture(self) -> np.ndarray:
         """What the driver sees: the observation, uint8 (96, 96, 3), or a decoded z, (64, 64, 3)."""
         return self.observation if self.world == "real" else self.dream.render()
@@ -190,9 +169,7 @@ class Session:
     def dream_trajectory(self) -> DreamTrajectory:
         """The last dream on this track. ValueError if nothing was driven in one."""
         if not self.dream_rows:
-            raise ValueError(
-                "nothing was driven in a dream on this track: enter('dream') and drive first"
-            )
+            raise ValueError("nothing was driven in a dream on this track: enter('dream') first")
         return DreamTrajectory(*map(np.array, zip(*self.dream_rows, strict=True)))
 
     def _step_real(self, driver: str) -> None:

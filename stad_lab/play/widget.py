@@ -62,20 +62,12 @@ def stop_loops() -> None:
 
 
 def drive_yourself(session: Session) -> ipywidgets.Widget:
-    """The widget of a session. At most one car drives in a kernel, the one started last.
-
-    Other cells may read the session at any time, for example its `trajectory()`.
-    """
+    """The widget of a session, which other cells may read; a kernel drives the last one started."""
     return Seat(session).view
 
 
 class Seat:
-    """The controls of a session and the picture.
-
-    Attributes:
-        view: all of it, the widget that a cell shows.
-        pace: pictures that the loop has lately made in a second.
-    """
+    """The controls of a session and its picture; `view` is all of it, `pace` pictures a second."""
 
     def __init__(self, session: Session):
         stop_loops()
@@ -83,7 +75,7 @@ class Seat:
         self.lock, self.described = threading.RLock(), 0.0  # when the status was last written
         size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE}
         self.picture = marked(ipywidgets.Image(format="png", **size), "pixels")
-        self.status, self.help = ipywidgets.HTML(), ipywidgets.HTML(HELP)
+        self.status = ipywidgets.HTML()
         self.go = marked(ipywidgets.ToggleButton(description="drive", icon="play"), "drive")
         self.driver = choice({"you": "hand", "the agent": "agent"}, session.driver)
         self.world = choice({"the real track": "real", "the dream": "dream"}, session.world)
@@ -104,38 +96,29 @@ class Seat:
         self.view.layout.flex_flow = "row wrap"
 
     def _controls(self) -> ipywidgets.VBox:
-        pedals = {
-            pedal: marked(ipywidgets.Button(icon=f"arrow-{icon}", tooltip=pedal), pedal)
+        size = {"width": "76px", "height": "40px"}
+        gas, *others = (
+            marked(ipywidgets.Button(icon=f"arrow-{icon}", tooltip=pedal, layout=size), pedal)
             for pedal, icon in PEDAL_ICONS.items()
-        }
-        for pedal in pedals.values():
-            pedal.layout = {"width": "76px", "height": "40px"}
+        )
         for control, width in ((self.go, 240), (self.track, 110), (self.begin, 124)):
             control.layout.width = f"{width}px"
-        below = ipywidgets.HBox([pedals[name] for name in ("left", "brake", "right")])
         cross = {"align_items": "center", "width": "240px"}
         rows = [self.status, self.go, self.driver, self.world]
-        rows += [
-            ipywidgets.Label("temperature of the dream"),
-            self.temperature,
-            ipywidgets.Label("frames a second (the real car: 50)"),
-            self.speed,
-            ipywidgets.Label("track"),
-            ipywidgets.HBox([self.track, self.begin]),
-            ipywidgets.VBox([pedals["gas"], below], layout=cross),
-        ]
-        rows += [self.help, self.wire, self.swap]
+        rows += [ipywidgets.Label("temperature of the dream"), self.temperature]
+        rows += [ipywidgets.Label("frames a second (the real car: 50)"), self.speed]
+        rows += [ipywidgets.Label("track"), ipywidgets.HBox([self.track, self.begin])]
+        rows += [ipywidgets.VBox([gas, ipywidgets.HBox(others)], layout=cross)]
+        rows += [ipywidgets.HTML(HELP), self.wire, self.swap]
         return ipywidgets.VBox(rows, layout={"width": "330px", "margin": "0 0 0 16px"})
 
     def _connect(self) -> None:
-        def on_value(control: ipywidgets.Widget, act: Callable) -> None:
-            control.observe(lambda change: act(change["new"]), "value")
-
-        on_value(self.go, self.drive)
-        on_value(self.driver, lambda driver: self._command(self.session.give, driver))
-        on_value(self.world, lambda world: self._command(self.session.enter, world))
-        on_value(self.temperature, lambda value: setattr(self.session.dream, "temperature", value))
-        on_value(self.wire, self.hold)
+        acts = {self.go: self.drive, self.wire: self.hold}
+        acts[self.driver] = lambda driver: self._command(self.session.give, driver)
+        acts[self.world] = lambda world: self._command(self.session.enter, world)
+        acts[self.temperature] = lambda value: setattr(self.session.dream, "temperature", value)
+        for control, act in acts.items():
+            control.observe(lambda change, act=act: act(change["new"]), "value")
         self.swap.on_click(lambda _: self.change_driver())
         self.begin.on_click(lambda _: self.begin_track())
 
@@ -155,6 +138,8 @@ class Seat:
         When an episode ends by itself, the game keeps the keys: one that is still held would be a
         command of JupyterLab.
         """
+        if not self.session.ended:
+            (self.view.add_class if on else self.view.remove_class)("stad-lab-driving")
         if on:
             self.loop = None  # a loop that is still ending must not change the new one's state
             stop_loops()
@@ -162,8 +147,6 @@ class Seat:
             self.loop.start()
         elif self.loop:
             self.loop.stopped.set()
-        if not self.session.ended:
-            (self.view.add_class if on else self.view.remove_class)("stad-lab-driving")
         self.go.description, self.go.icon = ("pause", "pause") if on else ("drive", "play")
 
     def begin_track(self) -> None:
@@ -231,11 +214,9 @@ def marked(widget: ipywidgets.DOMWidget, name: str) -> ipywidgets.DOMWidget:
 
 def script() -> ipywidgets.Output:
     """keys.js as an output, which JupyterLab runs when it shows it."""
-    source = Path(__file__).with_name("keys.js").read_text(encoding="utf-8")
-    data = {"application/javascript": source}
-    return ipywidgets.Output(
-        outputs=({"output_type": "display_data", "data": data, "metadata": {}},)
-    )
+    data = {"application/javascript": Path(__file__).with_name("keys.js").read_text("utf-8")}
+    output = {"output_type": "display_data", "data": data, "metadata": {}}
+    return ipywidgets.Output(outputs=(output,))
 
 
 def choice(options: dict[str, str], value: str) -> ipywidgets.ToggleButtons:

@@ -148,7 +148,7 @@ def made_with(config: Config) -> dict:
     """What the random driver's episodes depend on."""
     data = dataclasses.asdict(config.data)
     if not config.data.agent_episodes:
-        data = {name: value for name, value in data.items() if not name.startswith("agent_")}
+        del data["agent_frames"], data["agent_patience"]
     return {"seed": config.seed, "data": data}
 
 
@@ -210,8 +210,16 @@ def read_manifest(folder: Path, made_with: dict) -> dict:
     path = folder / MANIFEST
     if not path.exists():
         return {"kind": "dataset", "made_with": made_with, "episodes": []}
-    manifest = load_json(path, kind="dataset")
+    manifest = load_manifest(path)
     check_same(path, manifest["made_with"], made_with)
+    return manifest
+
+
+def load_manifest(path: Path, remedy: str = "collect again") -> dict:
+    """Read a manifest. ValueError if it is damaged, or of stad_lab 0.1."""
+    manifest = load_json(path, remedy, kind="dataset")
+    if "made_with" not in manifest:
+        raise ValueError(f"{path} was written by stad_lab 0.1: use that version, or collect again")
     return manifest
 
 
@@ -264,7 +272,7 @@ class Dataset:
     def __init__(self, folder: Path):
         self.folder = Path(folder)
         remedy = f"collect it first: python -m stad_lab train ... --dataset {self.folder}"
-        self.manifest = load_json(self.folder / MANIFEST, remedy, kind="dataset")
+        self.manifest = load_manifest(self.folder / MANIFEST, remedy)
         found, wanted = count_episodes(self.manifest)
         if found != wanted:
             raise ValueError(f"{self.folder} holds {found} of {wanted} episodes: {remedy}")
@@ -340,5 +348,5 @@ def check_seen(path: Path, seen: str | None, folder: Path) -> None:
         seen: checksum of the dataset that they were trained on; None if it is not known.
     """
     manifest = Path(folder) / MANIFEST
-    if seen and manifest.exists() and seen != dataset_checksum(load_json(manifest)):
+    if seen and manifest.exists() and seen != dataset_checksum(load_manifest(manifest)):
         raise ValueError(f"{path} was trained on another dataset than {folder}: give its own one")

@@ -61,6 +61,7 @@ def train_mdn_rnn(config: Config, dataset: Callable[[], Dataset], folder: Path) 
     if path.exists():
         check_vae(config, None, folder)
         check_mdn_rnn(config, folder)
+        path.with_name(CHECKPOINT).unlink(missing_ok=True)  # of a process that was killed
         return False
     data = dataset()
     check_vae(config, data.checksum, folder)
@@ -82,7 +83,6 @@ def check_mdn_rnn(config: Config, folder: Path) -> None:
     _, metadata = load_mdn_rnn(path)
     check_same(path, metadata, mdn_rnn_depends_on(config))
     check_belongs(path, metadata, vae=load_vae(path.with_name(VAE_FILE))[1]["weights"])
-    path.with_name(CHECKPOINT).unlink(missing_ok=True)  # of a process that was killed
 
 
 def mdn_rnn_depends_on(config: Config) -> dict:

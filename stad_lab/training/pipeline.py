@@ -27,7 +27,7 @@ from pathlib import Path
 import torch
 
 from stad_lab.agent import PRETRAINED, run_folder
-from stad_lab.config import PRESETS, Config, fields_of
+from stad_lab.config import PRESETS, Config, check_same, fields_of
 from stad_lab.io.files import copy_file, load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
@@ -99,7 +99,8 @@ def train(
         OSError: another process works in the folder, or a file cannot be read or written.
         TaskError, FloatingPointError: as raised by the stages.
     """
-    check_script()
+    if executor is None:
+        check_script()
     if until not in STAGES:
         raise ValueError(f"unknown stage {until!r}: choose one of {', '.join(STAGES)}")
     if (config.data.agent_episodes > 0) != (earlier is not None):
@@ -184,46 +185,49 @@ def run_stages(
     with locked(folder):
         record = open_record(config, folder, before)
         for name, stage in stages.items():
-            did = True  # an interrupted stage has worked, too
-            with timed(record, name, folder):
+            with timed(record, name, folder) as note:
                 try:
                     with worker_processes(config.processes, executor) as pool:
                         did = stage(pool)
-                except (ValueError, OSError):  # refused: nothing was done
-                    did = False
+                except (ValueError, OSError):  # refused, so the record stays as it was
                     raise
-                finally:
-                    record["worked"] = did
-            print(f"{name}: {'done' if did else 'already there, nothing to do'}")
+                except BaseException:  # an interrupted stage has worked, too
+                    note()
+                    raise
+                if did:
+                    note()
+            print(f"{name}: {'done' if did else 'already there, nothing to do'}", flush=True)
             worked |= did
-        record.pop("worked", None)
         record["budget"] = budget(config, folder, data)
-        save_json(folder / RECORD, record)
+        if worked or load_json(folder / RECORD) != record:
+            save_json(folder / RECORD, record)
     return worked
 
 
 @contextlib.contextmanager
-def timed(record: dict, stage: str, folder: Path) -> Iterator[None]:
-    """Add the time of a `with` block to the record; written while it runs, in case of a kill."""
-    before, begin, ended = record["seconds"].get(stage), time.perf_counter(), threading.Event()
+def timed(record: dict, stage: str, folder: Path) -> Iterator[Callable[[], None]]:
+    """Yields a function that adds the time of a `with` block to the record, and writes it.
+
+    A thread calls it during a long stage, so that a killed process has left its time.
+    """
+    before, begin, ended = record["seconds"].get(stage, 0.0), time.perf_counter(), threading.Event()
 
     def note() -> None:
-        record["seconds"][stage] = (before or 0.0) + time.perf_counter() - begin
-        save_json(folder / RECORD, {k: v for k, v in record.items() if k != "worked"})
+        record["seconds"][stage] = before + time.perf_counter() - begin
+        save_json(folder / RECORD, record)
 
     def beat() -> None:
         while not ended.wait(HEARTBEAT):
-            note()
+            with contextlib.suppress(OSError):  # a full disk stops the stage itself
+                note()
 
-    watch = threading.Thread(target=beat, daemon=True)
-    watch.start()
+    thread = threading.Thread(target=beat, daemon=True)
+    thread.start()
     try:
-        yield
+        yield note
     finally:
         ended.set()
-        watch.join()
-        if record.pop("worked", True):
-            note()
+        thread.join()
 
 
 def open_record(config: Config, folder: Path, before: dict | None) -> dict:
@@ -237,7 +241,10 @@ def open_record(config: Config, folder: Path, before: dict | None) -> dict:
     if not path.exists():
         earlier = {} if before is None else {"earlier": before}
         return {**new, "made_with": made, "seconds": {}, **earlier}
-    record = load_json(path, kind="record") | new
+    record = load_json(path, kind="record")
+    if (folder / VAE_FILE).exists():  # then its part of the configuration has not changed
+        check_same(path, record["config"], {n: new["config"][n] for n in ("variant", "seed", "vae")})
+    record |= new
     if made != starts(record)[-1]:
         record["continued_with"] = [*starts(record)[1:], made]
     return record
@@ -273,20 +280,24 @@ def command_of(config: Config) -> str:
         name: changes(config, Config.preset(name, variant=config.variant)) for name in PRESETS
     }
     name = min(changed, key=lambda name: len(changed[name]))
-    options = [f"--{option} {shlex.quote(str(value))}" for option, value in changed[name].items()]
+    options = [option_of(*change) for change in changed[name].items()]
     command = f"python -m stad_lab train {name} --variant {config.variant} --out ..."
     earlier = ["--earlier ..."] if config.data.agent_episodes else []
     return " ".join([command, *options, *earlier])
 
 
 def changes(config: Config, usual: Config) -> dict:
-    """Dotted command-line names and values of the fields that differ from `usual`."""
+    """Dotted names and values of the fields that differ from `usual`."""
     before = {name: value for name, _, value in fields_of(usual)}
-    return {
-        name.replace("_", "-"): value
-        for name, _, value in fields_of(config)
-        if value != before[name]
-    }
+    return {name: value for name, _, value in fields_of(config) if value != before[name]}
+
+
+def option_of(name: str, value: object) -> str:
+    """The command-line option that gives a field its value."""
+    stage, dot, field = name.replace("_", "-").rpartition(".")
+    if isinstance(value, bool):
+        return f"--{stage}{dot}{'' if value else 'no-'}{field}"
+    return f"--{stage}{dot}{field} {shlex.quote(str(value))}"
 
 
 def provenance(command: str) -> dict:

@@ -42,6 +42,7 @@ def train_vae(
     path = Path(folder) / VAE_FILE
     if path.exists():
         history = check_vae(config, None, folder)["history"]
+        path.with_name(CHECKPOINT).unlink(missing_ok=True)  # of a process that was killed
         if watch:
             watch(history)
         return False
@@ -74,7 +75,6 @@ def check_vae(config: Config, dataset: str | None, folder: Path) -> dict:
     check_same(path, metadata, vae_depends_on(config))
     if dataset and metadata["dataset"] and dataset != metadata["dataset"]:
         raise ValueError(f"{path} was trained on another dataset: give its own one")
-    path.with_name(CHECKPOINT).unlink(missing_ok=True)  # of a process that was killed
     return metadata
 
 

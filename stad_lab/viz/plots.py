@@ -548,37 +548,42 @@ def plot_stacks(stacks: dict[str, dict[str, float]], title: str, xlabel: str) ->
 
 
 def plot_intervals(
-    panels: dict[str, dict[str, dict[str, tuple[float, list[float]]]]],
+    panels: dict[str, dict[str, dict[str, tuple]]],
     title: str,
     xlabel: str,
     columns: int = 3,
     limits: tuple[float, float] | None = None,
+    sharex: bool = True,
 ) -> Figure:
-    """Values with their intervals, in panels, rows and coloured series.
+    """Values with their intervals, in panels, rows and series of their own colour and mark.
 
     Args:
-        panels: panel -> row -> series -> (value, [low, high]).
+        panels: panel -> row -> series -> (value, [low, high]), or with a list of single values
+            behind them, which become short lines.
         columns: panels beside each other.
         limits: of the common horizontal axis; an arrow at the edge marks a value further left.
     """
-    rows = list(next(iter(panels.values())))
-    contents = [row for found in panels.values() for row in found.values()]
+    rows, contents = list(next(iter(panels.values()))), []
+    for found in panels.values():
+        contents += found.values()
     names = list(dict.fromkeys(name for row in contents for name in row))
+    shifts = np.linspace(-0.25, 0.25, len(names)) if len(names) > 1 else [0]
+    styles = dict(zip(names, zip(cycle("oDs^vP"), cycle(COLORS), shifts), strict=False))
     lines, width = -(-len(panels) // columns), 2.0 + 2.5 * columns if columns > 1 else 6.5
-    height = max(0.32, 0.11 * len(names)) * len(rows) + 0.75  # of a panel, in inches
-    figure, axes = new_figure(width, lines * height + 0.7, lines, columns, sharex=True, sharey=True)
-    shifts = np.linspace(-0.2, 0.2, len(names)) if len(names) > 1 else [0]
-    styles = dict(zip(names, zip(cycle(COLORS), shifts, strict=False), strict=False))
+    height = lines * (max(0.32, 0.11 * len(names)) * len(rows) + 0.75) + 0.7  # inches
+    figure, axes = new_figure(width, height, lines, columns, sharex=sharex, sharey=True)
     for axis, (panel, found) in zip(axes.flat, panels.items(), strict=False):
         for (place, row), name in product(enumerate(rows), names):
             if name not in found[row]:
                 continue
-            (value, interval), (color, shift) = found[row][name], styles[name]
+            (value, interval, *single), (mark, color, shift) = found[row][name], styles[name]
             y = place + (shift if len(found[row]) > 1 else 0)
             outside = limits is not None and value < limits[0]
-            x, mark = (limits[0], "<") if outside else (value, "o")
+            x, mark = (limits[0], "<") if outside else (value, mark)
             axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.5)
             axis.plot(x, y, mark, color=color, ms=5, clip_on=not outside)
+            for values in single:
+                axis.plot(values, [y] * len(values), "|", color=color, ms=8, mew=1.5)
         name_rows(axis, rows)
         axis.grid(axis="x", color="0.9")
         axis.set_title(panel, fontsize=9)
@@ -587,7 +592,7 @@ def plot_intervals(
     if limits:  # a limit that is set no longer grows with later panels
         axes[0, 0].set_xlim(limits)
     if len(names) > 1:
-        legend_below(figure, axes[0, 0], {name: ("o", styles[name][0]) for name in names})
+        legend_below(figure, axes[0, 0], {name: styles[name][:2] for name in names})
     # Nobody would listen to a longer alternative text.
     read = names if sum(map(len, contents)) <= 40 else names[:1]
     values = [
@@ -600,39 +605,19 @@ def plot_intervals(
 
 
 def plot_claims(scores: dict[str, dict[str, tuple[float, list[float], list[float]]]]) -> Figure:
-    """The paper's score of each variant beside ours.
-
-    A dot is a mean with its interval, a short line through it one CMA-ES run. The second panel
-    enlarges 870 to 930.
+    """The paper's score of each variant beside ours, and enlarged from 870 to 930.
 
     Args:
-        scores: variant -> condition -> (mean, [low, high], means of the CMA-ES runs or []); the
-            first condition is the paper's. A variant may lack some.
+        scores: variant -> condition -> (mean, [low, high], means of the CMA-ES runs or []). A
+            variant may lack some conditions.
     """
-    names = list(dict.fromkeys(name for found in scores.values() for name in found))
-    panels = {"sharey": True, "gridspec_kw": {"width_ratios": [3, 2]}}
-    figure, ((whole, close),) = new_figure(9.0, 3.4, 1, 2, **panels)
-    shifts = np.linspace(-0.27, 0.27, len(names))
-    for axis, (place, found) in product((whole, close), enumerate(scores.values())):
-        for name, color, shift in zip(names, COLORS, shifts, strict=False):
-            if name in found:
-                (mean, interval, runs), y = found[name], place + shift
-                axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.4)
-                axis.plot(runs, [y] * len(runs), "|", color=color, ms=8, mew=1.5)
-                axis.plot(mean, y, "o" if runs else "D", color=color, ms=5)
-    name_rows(whole, scores)
-    close.set_xlim(870, 930)
-    for axis, panel in ((whole, "all"), (close, "enlarged")):
-        caption(axis, panel, "return")
-        axis.grid(axis="x", color="0.9")
-    marks = ["D", *"o" * (len(names) - 1)]
-    series = dict(zip(names, zip(marks, COLORS, strict=False), strict=False))
-    legend_below(figure, whole, series)
-    values = [
-        f"{variant} {name} {mean:.0f}"
-        + (f" (CMA-ES runs {', '.join(f'{own:.0f}' for own in runs)})" if runs else "")
-        for variant, found in scores.items()
-        for name, (mean, _, runs) in found.items()
-    ]
     title = "Mean return on 100 tracks: the paper's, and ours with 95% intervals and CMA-ES runs"
+    panels = {"all": scores, "enlarged": scores}
+    figure = plot_intervals(panels, title, "return", columns=2, sharex=False)
+    figure.axes[1].set_xlim(870, 930)
+    values = []
+    for variant, found in scores.items():
+        for name, (mean, _, runs) in found.items():
+            single = f" (CMA-ES runs {', '.join(f'{own:.0f}' for own in runs)})" if runs else ""
+            values.append(f"{variant} {name} {mean:.0f}{single}")
     return describe(figure, title, "; ".join(values))

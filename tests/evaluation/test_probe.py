@@ -1,4 +1,4 @@
-"""The probe finds a planted linear signal, finds nothing in noise, and never splits a drive."""
+"""The probe finds a planted linear signal, finds nothing in noise, and never splits an episode."""
 
 import itertools
 
@@ -8,18 +8,14 @@ import pytest
 from stad_lab.evaluation.probe import probe
 
 
-def planted(drives=40, length=50, noise=0.5, seed=0):
-    """Features with a linear signal in them: one target of known R2, one target of pure noise."""
-    rng = np.random.default_rng(seed)
-    features = rng.standard_normal((drives * length, 32))
+def planted(episodes=40, length=50, noise=0.5):
+    """Features that carry the first target with a known R2; the second target is noise."""
+    rng = np.random.default_rng(0)
+    features = rng.standard_normal((episodes * length, 32))
     signal = features @ rng.standard_normal(32)
-    signal /= signal.std()
-    target = signal + noise * rng.standard_normal(len(signal))
-    return (
-        features,
-        np.stack([target, rng.standard_normal(len(signal))], axis=1),
-        np.repeat(np.arange(drives), length),
-    )
+    target = signal / signal.std() + noise * rng.standard_normal(len(signal))
+    targets = np.stack([target, rng.standard_normal(len(signal))], axis=1)
+    return features, targets, np.repeat(np.arange(episodes), length)
 
 
 def test_a_planted_linear_signal_is_found_with_its_own_r2():
@@ -30,49 +26,49 @@ def test_a_planted_linear_signal_is_found_with_its_own_r2():
 
 
 def test_noise_and_shuffled_targets_are_not_found():
-    features, targets, drives = planted(noise=0.1)
-    assert probe(features, targets, drives)["r2"][0] > 0.95
-    assert abs(probe(features, targets, drives)["r2"][1]) < 0.1
+    features, targets, episodes = planted(noise=0.1)
+    found = probe(features, targets, episodes)["r2"]
+    assert found[0] > 0.95 and abs(found[1]) < 0.1
     shuffled = np.random.default_rng(1).permutation(targets)
-    assert np.abs(probe(features, shuffled, drives)["r2"]).max() < 0.1
+    assert np.abs(probe(features, shuffled, episodes)["r2"]).max() < 0.1
 
 
-def test_what_identifies_a_drive_is_not_mistaken_for_a_signal():
-    # Each drive has its own feature and its own target: rows split at random would be predicted perfectly.
+def test_what_identifies_an_episode_is_not_mistaken_for_a_signal():
+    # Each episode has a feature and a target of its own, which rows split at random would share.
     rng = np.random.default_rng(0)
-    drives = np.repeat(np.arange(30), 40)
-    features = np.eye(30)[drives] + 0.01 * rng.standard_normal((1200, 30))
-    targets = rng.standard_normal(30)[drives][:, None]
-    assert probe(features, targets, drives)["r2"][0] < 0.1
+    episodes = np.repeat(np.arange(30), 40)
+    features = np.eye(30)[episodes] + 0.01 * rng.standard_normal((1200, 30))
+    targets = rng.standard_normal(30)[episodes][:, None]
+    assert probe(features, targets, episodes)["r2"][0] < 0.1
 
 
-def test_an_interval_is_over_drives_and_does_not_narrow_if_their_rows_are_repeated():
-    rng, (features, targets, drives) = np.random.default_rng(0), planted(drives=20, length=10)
-    targets = targets + rng.standard_normal(20)[drives][:, None]  # drives differ
-    once, often = (
-        probe(*(np.repeat(part, n, axis=0) for part in (features, targets, drives)))
-        for n in (1, 30)
-    )
-    widths = [found["high"] - found["low"] for found in (once, often)]
+def test_an_interval_is_over_episodes_and_does_not_narrow_if_their_rows_are_repeated():
+    features, targets, episodes = planted(episodes=20, length=10)
+    rng = np.random.default_rng(0)
+    targets = targets + rng.standard_normal(20)[episodes][:, None]  # episodes differ
+    widths = []
+    for count in (1, 30):
+        rows = (np.repeat(part, count, axis=0) for part in (features, targets, episodes))
+        found = probe(*rows)
+        widths.append(found["high"] - found["low"])
     assert widths[1] == pytest.approx(widths[0], rel=0.3)
 
 
-def test_the_penalty_is_chosen_on_drives_that_the_r2_is_not_measured_on(monkeypatch):
+def test_the_penalty_is_chosen_on_episodes_that_r2_is_not_measured_on(monkeypatch):
     asked = []
-    monkeypatch.setattr(
-        "stad_lab.evaluation.probe.choose_penalties",
-        lambda *given: asked.append(given[2:]) or np.ones(2),
-    )
-    features, targets, drives = planted()
-    found = probe(features, targets, drives)["r2"]
+
+    def noting(features, targets, fit, trial):
+        asked.append((fit, trial))
+        return np.ones(2)
+
+    monkeypatch.setattr("stad_lab.evaluation.probe.choose_penalties", noting)
+    features, targets, episodes = planted()
+    assert probe(features, targets, episodes)["r2"][0] > 0.7
     ((fit, trial),) = asked
-    assert (
-        not set(drives[fit]) & set(drives[trial]) and len(set(drives[fit | trial])) == 24
-    )  # of forty
-    targets[fit | trial] = 0.0  # what is measured are the others: nothing that was fitted is left
-    assert (
-        found[0] > 0.7 and probe(features, targets + 1e-9 * features[:, :2], drives)["r2"][0] < 0.1
-    )
+    assert not set(episodes[fit]) & set(episodes[trial])
+    assert len(set(episodes[fit | trial])) == 24  # of forty
+    targets[fit | trial] = 0.0  # nothing that was fitted on is left
+    assert probe(features, targets + 1e-9 * features[:, :2], episodes)["r2"][0] < 0.1
 
 
 def test_the_same_seed_gives_the_same_numbers():
@@ -83,10 +79,10 @@ def test_the_same_seed_gives_the_same_numbers():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda f, t, d: (f[1:], t, d), "1999 rows of features, 2000 of targets"),
-        (lambda f, t, d: (f * np.nan, t, d), "not finite"),
-        (lambda f, t, d: (f, t, d % 9), "9 drives: expected at least 10"),
-        (lambda f, t, d: (f, 0 * t + 1, d), "one value throughout"),
+        (lambda f, t, e: (f[1:], t, e), "1999 rows of features, 2000 of targets"),
+        (lambda f, t, e: (f * np.nan, t, e), "not finite"),
+        (lambda f, t, e: (f, t, e % 9), "9 episodes: expected at least 10"),
+        (lambda f, t, e: (f, 0 * t + 1, e), r"targets \[0, 1\] are constant"),
     ],
 )
 def test_rows_that_cannot_be_probed_are_refused(change, message):

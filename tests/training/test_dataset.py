@@ -1,7 +1,6 @@
-"""The random driver's dataset: complete, checked, of any size, and the same after any interrupt."""
+"""The random driver's dataset: complete, checked, and the same after any interrupt."""
 
 import hashlib
-import itertools
 import json
 import shutil
 import signal
@@ -14,148 +13,133 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stad_lab.__main__ import main
-from stad_lab.config import Settings
+from stad_lab.cli import main
+from stad_lab.config import TRACK_RANGES, Config
 from stad_lab.envs.car_racing import make_env
 from stad_lab.envs.frames import difference_image, episode_differences, to_frame
-from stad_lab.io.files import checksum, locked, save_json
+from stad_lab.io.files import checksum, load_json, locked, save_json
 from stad_lab.training.dataset import (
-    TRACK_RANGES,
+    MANIFEST,
+    Dataset,
     RandomDriver,
-    Rollouts,
-    block_path,
-    collect_rollouts,
+    check_seen,
+    collect,
     drive_randomly,
-    track_seeds,
+    episode_file,
 )
 
-MANY = {
-    "episodes": 40,
-    "episode_frames": 30,
-}  # a second of driving at least, so an interrupt comes in the middle
+QUICK = Config.preset("quick")
+# A second of driving at least, so that an interrupt comes in the middle.
+MANY = {"episodes": 40, "episode_frames": 30}
 
 
 @pytest.fixture(scope="module")
-def one_go(tmp_path_factory):
+def uninterrupted(tmp_path_factory):
     """Many short episodes, collected by one process without interruption."""
-    folder = tmp_path_factory.mktemp("rollouts") / "one_go"
-    assert collect_rollouts(Settings.preset("quick", **MANY, processes=1), folder)
+    folder = tmp_path_factory.mktemp("dataset") / "uninterrupted"
+    assert collect(QUICK.replace(data=MANY, processes=1), folder)
     return folder
 
 
 @pytest.fixture
 def copied(quick_run, tmp_path):
     """A dataset that a test may damage."""
-    return shutil.copytree(quick_run / "rollouts", tmp_path / "rollouts")
+    return shutil.copytree(quick_run / "dataset", tmp_path / "dataset")
 
 
 def contents(folder):
-    """The bytes of every file in a folder by its name; a killed process may leave hidden half-written files."""
+    """The bytes of every file by its name, without the hidden ones that a kill may leave."""
     return {
         path.name: path.read_bytes() for path in folder.iterdir() if not path.name.startswith(".")
     }
 
 
 def collect_command(folder):
-    """The command that collects the same episodes as `one_go`, with two processes."""
-    command = [
-        sys.executable,
-        "-m",
-        "stad_lab",
-        "train",
-        "--variant",
-        "frame",
-        "--settings",
-        "quick",
-    ]
-    command += ["--until", "rollouts", "--out", str(folder)]
-    for name, value in MANY.items():
-        command += ["--set", f"{name}={value}"]
-    return command
+    """The arguments that collect the same episodes as `uninterrupted`, with two processes."""
+    changes = ["--data.episodes", "40", "--data.episode-frames", "30"]
+    return ["train", "quick", "--until", "dataset", "--out", str(folder), *changes]
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send to a process")
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGINT"])
-def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(how, one_go, tmp_path):
-    manifest = tmp_path / "run" / "rollouts" / "manifest.json"
-    process = subprocess.Popen(collect_command(tmp_path / "run"), stderr=subprocess.PIPE, text=True)
+def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(
+    how, uninterrupted, tmp_path
+):
+    manifest, arguments = tmp_path / "run" / "dataset" / MANIFEST, collect_command(tmp_path / "run")
+    command = [sys.executable, "-m", "stad_lab", *arguments]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.time() + 120
-    while (
-        not manifest.exists() or len(json.loads(manifest.read_text(encoding="utf-8"))["blocks"]) < 3
-    ):
+    while not manifest.exists() or len(load_json(manifest)["episodes"]) < 3:
         assert time.time() < deadline
         time.sleep(0.005)
     process.send_signal(getattr(signal, how))
     error = process.communicate(timeout=60)[1]
     if how == "SIGINT":
         assert process.returncode == 130, error
-        assert "the same command goes on" in error
-        assert "Traceback" not in error
-    done = json.loads(manifest.read_text(encoding="utf-8"))["blocks"]
+        assert "the same command continues" in error and "Traceback" not in error
+    done = load_json(manifest)["episodes"]
     assert 3 <= len(done) < MANY["episodes"]  # it was in the middle
-    before = {path.name: path.stat().st_mtime_ns for path in manifest.parent.iterdir()}
-    assert main(collect_command(tmp_path / "run")[3:]) == 0
+    before = {path: path.stat().st_mtime_ns for path in manifest.parent.iterdir()}
+    assert main(arguments) == 0
     for entry in done:  # not collected again
-        for name in (f"{entry['index']:05d}.frames.npy", f"{entry['index']:05d}.actions.npy"):
-            assert (manifest.parent / name).stat().st_mtime_ns == before[name]
-    assert contents(manifest.parent) == contents(one_go)
-    assert len(json.loads(manifest.read_text(encoding="utf-8"))["blocks"]) == MANY["episodes"]
+        for name in ("frames", "actions"):
+            path = episode_file(manifest.parent, entry["index"], name)
+            assert path.stat().st_mtime_ns == before[path]
+    assert contents(manifest.parent) == contents(uninterrupted)
 
 
 def test_a_complete_collection_is_left_alone(copied):
     before = contents(copied)
-    assert not collect_rollouts(Settings.preset("quick"), copied)
+    assert not collect(QUICK, copied)
     assert contents(copied) == before
 
 
 def test_what_another_process_collected_a_moment_ago_is_not_driven_again(tmp_path, monkeypatch):
-    settings, folder, lock = (
-        Settings.preset("quick", episodes=3, episode_frames=30),
-        tmp_path / "shared",
-        locked,
-    )
+    config, folder = QUICK.replace(data={"episodes": 3, "episode_frames": 30}), tmp_path / "shared"
     written = {}
 
     def lock_late(place):
-        monkeypatch.setattr("stad_lab.training.dataset.locked", lock)
+        monkeypatch.setattr("stad_lab.training.dataset.locked", locked)
         with ThreadPoolExecutor(1) as other:
-            collect_rollouts(settings, folder, other)
+            collect(config, folder, other)
         written.update({path: path.stat().st_mtime_ns for path in folder.glob("*.npy")})
-        return lock(place)
+        return locked(place)
 
     monkeypatch.setattr("stad_lab.training.dataset.locked", lock_late)
     with ThreadPoolExecutor(1) as executor:
-        assert not collect_rollouts(settings, folder, executor)
-    assert len(Rollouts(folder).frames) == 3
-    assert written and {path: path.stat().st_mtime_ns for path in folder.glob("*.npy")} == written
+        assert not collect(config, folder, executor)
+    assert len(Dataset(folder).frames) == 3
+    assert {path: path.stat().st_mtime_ns for path in folder.glob("*.npy")} == written != {}
 
 
-def test_the_manifest_tells_settings_seeds_counts_and_checksums(quick_run):
-    folder = quick_run / "rollouts"
-    manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-    settings = Settings.preset("quick")
-    assert {name: getattr(settings, name) for name in manifest["settings"]} == manifest["settings"]
-    assert [entry["index"] for entry in manifest["blocks"]] == list(range(settings.episodes))
-    for entry in manifest["blocks"]:
-        assert TRACK_RANGES["collect"][0] <= entry["track"] < TRACK_RANGES["collect"][1]
+def test_the_manifest_has_the_configuration_the_tracks_the_lengths_and_the_checksums(quick_run):
+    folder = quick_run / "dataset"
+    manifest = load_json(folder / MANIFEST)
+    made_with, data = manifest["made_with"], QUICK.as_dict()["data"]
+    assert made_with["seed"] == QUICK.seed
+    assert made_with["data"] == {name: data[name] for name in made_with["data"]}
+    assert [entry["index"] for entry in manifest["episodes"]] == list(range(QUICK.data.episodes))
+    low, high = TRACK_RANGES["collect"]
+    for entry in manifest["episodes"]:
+        assert low <= entry["track"] < high
         for name in ("frames", "actions"):
-            file = folder / f"{entry['index']:05d}.{name}.npy"
+            file = episode_file(folder, entry["index"], name)
             assert len(np.load(file)) == entry["frames"]
             assert hashlib.sha256(file.read_bytes()).hexdigest() == entry[f"{name}_sha256"]
 
 
-def test_a_block_can_be_driven_again(quick_run):
-    rollouts = Rollouts(quick_run / "rollouts")
-    frames, actions, track = drive_randomly(Settings.preset("quick"), 3)
-    assert np.array_equal(frames, rollouts.frames[3])
-    assert np.array_equal(actions, rollouts.actions[3])
-    assert track == rollouts.manifest["blocks"][3]["track"]
+def test_an_episode_can_be_driven_again_bit_for_bit(quick_run):
+    dataset = Dataset(quick_run / "dataset")
+    frames, actions, track = drive_randomly(QUICK, 3)
+    assert np.array_equal(frames, dataset.frames[3])
+    assert np.array_equal(actions, dataset.actions[3])
+    assert track == dataset.manifest["episodes"][3]["track"]
 
 
 @pytest.mark.parametrize("crop_bar", [True, False])
-def test_an_action_stands_beside_the_frame_that_the_driver_saw(crop_bar):
-    settings = Settings.preset("quick", random_starts=0.0, crop_bar=crop_bar)
-    frames, actions, track = drive_randomly(settings, 1)
+def test_an_action_is_kept_with_the_frame_on_which_it_was_taken(crop_bar):
+    config = QUICK.replace(data={"random_starts": 0.0, "crop_bar": crop_bar})
+    frames, actions, track = drive_randomly(config, 1)
     env = make_env()
     observation, _ = env.reset(seed=track)
     for frame, action in zip(frames, actions, strict=True):
@@ -165,200 +149,162 @@ def test_an_action_stands_beside_the_frame_that_the_driver_saw(crop_bar):
 
 
 def test_frames_are_uint8_and_actions_float32(quick_run):
-    rollouts = Rollouts(quick_run / "rollouts")
-    for frames, actions in zip(rollouts.frames, rollouts.actions, strict=True):
-        assert frames.dtype == np.uint8
-        assert frames.shape[1:] == (64, 64, 3)
-        assert actions.dtype == np.float32
-        assert actions.shape == (len(frames), 3)
+    dataset = Dataset(quick_run / "dataset")
+    for frames, actions in zip(dataset.frames, dataset.actions, strict=True):
+        assert frames.dtype == np.uint8 and frames.shape[1:] == (64, 64, 3)
+        assert actions.dtype == np.float32 and actions.shape == (len(frames), 3)
 
 
 READ_ALL = """
-import sys
+import resource, sys
 import numpy as np
 from pathlib import Path
-from stad_lab.io.workers import peak_memory
-from stad_lab.training.dataset import Rollouts
+from stad_lab.training.dataset import Dataset
 
-before = peak_memory()["process"]
-rollouts = Rollouts(Path(sys.argv[1]))
-for indices in np.array_split(np.arange(len(rollouts)), 100):
-    rollouts.pairs(indices, stride=4)
-total = sum(frames.nbytes for frames in rollouts.frames)
-print(total / 1e6, peak_memory()["process"] - before)
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+before = peak()
+dataset = Dataset(Path(sys.argv[1]))
+for indices in np.array_split(np.arange(len(dataset)), 100):
+    dataset.pairs(indices, stride=4)
+print(sum(frames.nbytes for frames in dataset.frames) / 1e6, peak() - before)
 """
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows does not tell a process's peak memory")
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no module `resource`")
 def test_reading_a_dataset_takes_little_memory_however_large_it_is(tmp_path):
-    episodes, length = 50, 400
-    blocks = []
-    for index in range(episodes):
+    length, episodes = 400, []
+    arrays = {"frames": np.zeros((length, 64, 64, 3), np.uint8)}
+    arrays["actions"] = np.zeros((length, 3), np.float32)
+    for index in range(50):
         entry = {"index": index, "track": index, "frames": length}
-        for name, array in [
-            ("frames", np.zeros((length, 64, 64, 3), np.uint8)),
-            ("actions", np.zeros((length, 3))),
-        ]:
-            path = block_path(tmp_path, index, name)
-            np.save(path, array.astype(np.uint8 if name == "frames" else np.float32))
+        for name, array in arrays.items():
+            path = episode_file(tmp_path, index, name)
+            np.save(path, array)
             entry[f"{name}_sha256"] = checksum(path.read_bytes())
-        blocks.append(entry)
-    save_json(tmp_path / "manifest.json", {"settings": {"episodes": episodes}, "blocks": blocks})
-    process = subprocess.run(
-        [sys.executable, "-c", READ_ALL, tmp_path], capture_output=True, text=True, timeout=60
-    )
+        episodes.append(entry)
+    made_with = {"data": {"episodes": len(episodes)}}
+    save_json(tmp_path / MANIFEST, {"made_with": made_with, "episodes": episodes})
+    command = [sys.executable, "-c", READ_ALL, tmp_path]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert process.returncode == 0, process.stderr
     megabytes, grown = map(float, process.stdout.split())
-    assert megabytes > 200
-    assert grown < 40
+    assert megabytes > 200 and grown < 40
 
 
-def test_a_collection_says_its_size_on_the_disk_and_starts_only_if_there_is_room(
+def test_a_collection_prints_its_size_and_starts_only_if_the_disk_has_the_space(
     quick_training, tmp_path, monkeypatch
 ):
     folder, process, _ = quick_training
-    assert "rollouts: up to 0.01 GB in " in process.stdout
-    size = sum(file.stat().st_size for file in (folder / "rollouts").glob("*.npy"))
+    assert "dataset: up to 0.01 GB in " in process.stdout
+    size = sum(file.stat().st_size for file in (folder / "dataset").glob("*.npy"))
     assert size == pytest.approx(8 * 60 * (64 * 64 * 3 + 12), rel=0.02)
     monkeypatch.setattr(shutil, "disk_usage", lambda place: SimpleNamespace(free=122_000_000_000))
-    with pytest.raises(
-        OSError,
-        match=r"up to 123\.00 GB in .* 122\.00 GB are free: free some room, choose a folder on another",
-    ):
-        collect_rollouts(
-            Settings.preset("quick", episodes=10_000, episode_frames=1000), tmp_path / "huge"
-        )
+    huge = QUICK.replace(data={"episodes": 10_000, "episode_frames": 1000})
+    with pytest.raises(OSError, match=r"up to 123\.00 GB in .* 122\.00 GB are free: free some sp"):
+        collect(huge, tmp_path / "huge")
     assert [file.name for file in (tmp_path / "huge").iterdir()] == [".lock"]
 
 
 def test_pairs_are_the_frames_of_the_difference_images(quick_run):
-    rollouts = Rollouts(quick_run / "rollouts")
-    assert len(rollouts) == sum(len(frames) for frames in rollouts.frames)
-    frames, earlier = rollouts.pairs(np.arange(len(rollouts)), stride=4)
-    expected = np.concatenate([episode_differences(frames, 4) for frames in rollouts.frames])
-    assert np.array_equal(frames, np.concatenate(rollouts.frames))
+    dataset = Dataset(quick_run / "dataset")
+    frames, earlier = dataset.pairs(np.arange(len(dataset)), stride=4)
+    expected = np.concatenate([episode_differences(frames, 4) for frames in dataset.frames])
+    assert np.array_equal(frames, np.concatenate(list(dataset.frames)))
     assert np.array_equal(difference_image(frames, earlier), expected)
 
 
-def test_whole_episodes_are_held_out(quick_run):
-    rollouts = Rollouts(quick_run / "rollouts")
-    training, heldout = rollouts.split()
-    assert sorted([*training, *heldout]) == list(range(len(rollouts)))
-    assert len(training) > len(heldout) > 0
-    assert not set(rollouts.episode[training]) & set(rollouts.episode[heldout])
-
-
-def test_the_last_twentieth_of_the_episodes_is_held_out():
-    episode = np.repeat(np.arange(40), 3)
-    training, heldout = Rollouts.split(SimpleNamespace(frames=range(40), episode=episode))
-    assert training.tolist() == list(range(38 * 3)) and heldout.tolist() == list(
-        range(38 * 3, 40 * 3)
-    )
-
-
-def test_the_five_uses_share_no_track():
-    ranges = sorted(TRACK_RANGES.values())
-    assert all(before[1] <= after[0] for before, after in itertools.pairwise(ranges))
-    for use, (low, high) in TRACK_RANGES.items():
-        assert all(low <= track < high for track in track_seeds(use, 1000, 0))
-    assert (
-        track_seeds("evolve", 4, 0, 1)
-        != track_seeds("evolve", 4, 0, 2)
-        != track_seeds("evolve", 4, 1, 2)
-    )
+def test_whole_episodes_the_last_twentieth_are_held_out(quick_run):
+    dataset = Dataset(quick_run / "dataset")
+    training, heldout = dataset.split()
+    assert sorted([*training, *heldout]) == list(range(len(dataset)))
+    assert set(dataset.episode[heldout]) == {7} and 7 not in dataset.episode[training]
+    for episodes, first in ((40, 38), (900, 855), (2, 1)):
+        sized = SimpleNamespace(frames=range(episodes))
+        assert Dataset.first_heldout.fget(sized) == first
 
 
 def test_the_random_driver_gives_smooth_actions_within_bounds():
     driver = RandomDriver(np.random.default_rng(0))
     actions = np.array([driver.act() for _ in range(5000)])
     assert actions.dtype == np.float32
-    assert (actions >= [-1, 0, 0]).all()
-    assert (actions <= 1).all()
+    assert (actions >= [-1, 0, 0]).all() and (actions <= 1).all()
     assert abs(actions[:, 0].mean()) < 0.1  # turns to both sides
     assert np.abs(np.diff(actions[:, 0])).mean() < 0.5 * actions[:, 0].std()
     assert 0 < (actions[:, 2] > 0).mean() < 0.3  # brakes, rarely
     assert not ((actions[:, 1] > 0) & (actions[:, 2] > 0)).any()
 
 
-def test_most_episodes_start_on_their_way():
-    moving = Settings.preset("quick", random_starts=1.0, episode_frames=25)
-    at_rest = Settings.preset("quick", random_starts=0.0, episode_frames=25)
+def test_random_starts_begin_on_the_road_and_not_in_the_opening_zoom():
     for index in range(2):
-        zoomed_out, close = (
-            drive_randomly(at_rest, index)[0][0],
-            drive_randomly(moving, index)[0][0],
-        )
-        assert (
-            (zoomed_out == 0).mean() > 0.2 > (close == 0).mean()
-        )  # the opening zoom shows the dark outside
+        dark = []  # share of black pixels in the first frame: the zoom shows what is outside
+        for share in (0.0, 1.0):
+            data = {"random_starts": share, "episode_frames": 25}
+            dark.append((drive_randomly(QUICK.replace(data=data), index)[0][0] == 0).mean())
+        assert dark[0] > 0.2 > dark[1]
 
 
-@pytest.mark.parametrize("name", ["00002.frames.npy", "00005.actions.npy"])
-def test_a_missing_block_is_an_error_that_names_it(name, copied):
-    (copied / name).unlink()
-    with pytest.raises(
-        FileNotFoundError,
-        match=f"{name} is missing although the manifest lists it: delete .* again",
-    ):
-        Rollouts(copied)
+def cut(path, length):
+    path.write_bytes(path.read_bytes()[:length])
 
 
-def test_a_block_cut_short_is_an_error_that_names_it(copied):
-    block = copied / "00002.frames.npy"
-    block.write_bytes(block.read_bytes()[:5000])
-    with pytest.raises(
-        ValueError,
-        match=r"00002.frames.npy is damaged \(5000 bytes.*checksum.*delete .* collect again",
-    ):
-        Rollouts(copied)
-
-
-def test_a_file_cut_short_after_it_was_found_whole_gives_no_pictures(copied):
-    rollouts = Rollouts(copied)
-    path = sorted(copied.glob("*.frames.npy"))[-1]
-    path.write_bytes(path.read_bytes()[:2000])
-    with pytest.raises(
-        ValueError, match=r"frames\.npy is shorter than it was: collect in another folder"
-    ):
-        rollouts.pairs(np.array([len(rollouts) - 1]), 4)
-
-
-def test_one_flipped_bit_is_an_error_that_names_the_block(copied):
-    block = copied / "00004.frames.npy"
-    content = bytearray(block.read_bytes())
+def flip_last_bit(path):
+    content = bytearray(path.read_bytes())
     content[-1] ^= 1
-    block.write_bytes(content)
-    with pytest.raises(ValueError, match=r"00004.frames.npy is damaged.*delete .* collect again"):
-        Rollouts(copied)
+    path.write_bytes(content)
 
 
-def test_a_damaged_manifest_is_an_error_that_names_it(copied):
-    manifest = copied / "manifest.json"
-    manifest.write_text(manifest.read_text(encoding="utf-8")[:100])
-    with pytest.raises(ValueError, match=r"manifest.json is damaged.*delete it and collect"):
-        Rollouts(copied)
+@pytest.mark.parametrize(
+    ("name", "damage", "error"),
+    [
+        ("00002.frames.npy", lambda path: path.unlink(), "does not exist: delete .* collect again"),
+        ("00005.actions.npy", lambda path: path.unlink(), "does not exist: delete .* collect agai"),
+        ("00002.frames.npy", lambda path: cut(path, 5000), "is damaged.*delete .* collect again"),
+        ("00004.frames.npy", flip_last_bit, "is damaged.*delete .* collect again"),
+        (MANIFEST, lambda path: cut(path, 100), "is damaged.*delete it and collect"),
+        (MANIFEST, lambda path: path.unlink(), "does not exist: collect it first: python -m stad_"),
+    ],
+)
+def test_a_missing_or_damaged_file_is_an_error_that_names_it(name, damage, error, copied):
+    damage(copied / name)
+    with pytest.raises((ValueError, FileNotFoundError), match=f"{name} {error}"):
+        Dataset(copied)
 
 
-def test_a_folder_without_rollouts_is_an_error_that_names_the_command(tmp_path):
-    with pytest.raises(
-        FileNotFoundError,
-        match=r"manifest.json does not exist.*collect the rollouts first: python -m",
-    ):
-        Rollouts(tmp_path / "nowhere")
+def test_a_file_cut_short_after_it_was_checked_gives_no_frames(copied):
+    dataset = Dataset(copied)
+    cut(sorted(copied.glob("*.frames.npy"))[-1], 2000)
+    with pytest.raises(ValueError, match=r"frames\.npy was cut short: collect in a new folder"):
+        dataset.pairs(np.array([len(dataset) - 1]), 4)
 
 
-def test_rollouts_of_other_settings_are_refused(copied):
+def test_a_dataset_of_another_configuration_is_refused_and_stays_as_it_was(copied):
     before = contents(copied)
-    with pytest.raises(
-        ValueError,
-        match=r"'episodes': 8.*'episodes': 9.*choose another folder or the same settings",
+    for config, was in (
+        (QUICK.replace(data={"episodes": 9}), "data.episodes=8, now data.episodes=9"),
+        (QUICK.replace(seed=1), "seed=0, now seed=1"),
+        # Of a second iteration, whose dataset has the episodes of both drivers.
+        (QUICK.replace(data={"agent_episodes": 3}), "data.agent_episodes=0, now data.agent_episod"),
     ):
-        collect_rollouts(Settings.preset("quick", episodes=9), copied)
+        with pytest.raises(ValueError, match=f"{was}.*choose another folder"):
+            collect(config, copied)
     assert contents(copied) == before
 
 
 def test_an_unfinished_collection_is_not_taken_for_a_dataset(copied):
-    manifest = json.loads((copied / "manifest.json").read_text(encoding="utf-8"))
-    save_json(copied / "manifest.json", manifest | {"blocks": []})
-    with pytest.raises(ValueError, match=r"\b0\b.*\b8\b.*collect"):
-        Rollouts(copied)
+    manifest = load_json(copied / MANIFEST)
+    save_json(copied / MANIFEST, manifest | {"episodes": []})
+    with pytest.raises(ValueError, match=r"holds 0 of 8 episodes: collect"):
+        Dataset(copied)
+
+
+def test_a_dataset_of_the_first_edition_is_refused_with_the_version_that_reads_it(tmp_path):
+    settings = {"episodes": 8, "episode_frames": 60, "seed": 0}
+    save_json(tmp_path / MANIFEST, {"settings": settings, "blocks": []})
+    for read in (
+        Dataset,
+        lambda folder: collect(QUICK, folder),
+        lambda folder: check_seen(folder / "vae.safetensors", "a checksum", folder),
+    ):
+        with pytest.raises(ValueError, match=r"manifest.json was written by stad_lab 0\.1"):
+            read(tmp_path)
+    assert json.loads((tmp_path / MANIFEST).read_text())["settings"] == settings
