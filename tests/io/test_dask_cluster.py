@@ -215,7 +215,7 @@ def test_a_cluster_whose_workers_have_other_versions_is_refused(scheduler, monke
 
 def test_a_worker_that_lacks_a_package_is_refused(scheduler, monkeypatch):
     monkeypatch.setattr("stad_lab.io.dask_cluster.versions", lack_a_package)
-    error = r"a worker of tcp://.* lacks a package \(.*nowhere"
+    error = r"worker of tcp://.* lacks a package \(.*nowhere"
     with pytest.raises(ValueError, match=error), cluster(scheduler[0]):
         pass
 
