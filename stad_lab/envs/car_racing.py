@@ -109,9 +109,9 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         self._show()
         return self.cars.draw()[0], float(rewards[0]), bool(ended[0]), False, info
 
-    def place(self, tile: int, **how) -> np.ndarray:
+    def place(self, tile: int, *how: float, **named: float) -> np.ndarray:
         """Put the car on a tile, as `Cars.place`; returns the observation there."""
-        self.cars.place(0, tile, **how)
+        self.cars.place(0, tile, *how, **named)
         return self.cars.draw()[0]
 
     def render(self) -> np.ndarray | None:
