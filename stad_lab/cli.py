@@ -374,7 +374,7 @@ def benchmark(
     """Measure speeds side by side with Gymnasium and EnvPool, on a machine that does nothing else.
 
     Args:
-        parts: Some of parity, renderer, loop, training, cluster; all if not given.
+        parts: Some of parity, renderer, loop, training; all if not given.
         rounds: How often the contenders take turns.
         json: Where to write every measurement.
     """

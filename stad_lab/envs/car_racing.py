@@ -147,9 +147,9 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         """Where the hull is, world units, float64 (2,)."""
         return self.cars.cars["position"][0, 0].astype(float)
 
-    def place(self, tile: int, **how) -> np.ndarray:
+    def place(self, tile: int, *how: float, **named: float) -> np.ndarray:
         """Put the car on a tile, as `Cars.place`; returns the observation there."""
-        self.cars.place(0, tile, **how)
+        self.cars.place(0, tile, *how, **named)
         return self.cars.draw()[0]
 
     def render(self) -> np.ndarray | None:
