@@ -13,7 +13,7 @@ from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.training.dataset import RandomDriver
 
 CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))
-AREAS = ["observation", "window of 24 x 24 around the car", "indicator bar"] + [
+AREAS = ["whole picture", "window of 24 x 24 around the car", "indicator bar"] + [
     f"{frame} against to_frame of {seen} observation"
     for frame in ("cropped frame", "frame")
     for seen in ("our", "Gymnasium's")
