@@ -75,7 +75,7 @@ class Agent:
         Raises:
             ValueError: another shape or dtype, or an action that is not finite.
         """
-        return self.act_batch([observation])[0]
+        return self.act_batch([to_frame(observation, self.world_model.crop_bar)])[0]
 
     @torch.inference_mode()
     def act_batch(self, seen: Sequence[np.ndarray]) -> np.ndarray:
@@ -146,7 +146,7 @@ class Agent:
 
 
 class Driver(Protocol):
-    """What `rollout` needs of a driver: an Agent, or anything else that acts."""
+    """What `rollout` needs: an Agent, or anything else that acts."""
 
     def reset(self) -> None:
         """Begin new episodes."""
@@ -172,7 +172,7 @@ class Batch(Protocol):
 
 
 class EnvBatch:
-    """Gymnasium environments, which have been reset, as a batch; each is closed at its end.
+    """Gymnasium environments, which have been reset, as a batch.
 
     Args:
         envs: the environments.
@@ -196,20 +196,15 @@ class EnvBatch:
             found = self.envs[car].step(action)
             self.observations[car], rewards[place] = found[:2]
             ended[place] = found[2] or found[3]
-            if ended[place]:
-                self.envs[car].close()
         return rewards, ended
 
 
 class Episodes(NamedTuple):
     """What `rollout` returns."""
 
-    returns: np.ndarray
-    """float64 (episodes,)."""
-    lengths: np.ndarray
-    """Frames, int (episodes,)."""
-    rewards: list[list[float]]
-    """Of every frame, for each episode."""
+    returns: np.ndarray  # float64 (episodes,)
+    lengths: np.ndarray  # frames, int (episodes,)
+    rewards: list[list[float]]  # of every frame, for each episode
 
 
 Observe = Callable[[np.ndarray, np.ndarray, np.ndarray], None]
@@ -274,13 +269,17 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
     if min(tracks, default=0) < 0:
         raise ValueError(f"track {min(tracks)}: expected at least 0, the seed of a track")
     if fast:
-        batch = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)
-        batch.reset(tracks)
-    else:
-        envs = [make_env(fast=False) for _ in tracks]
+        cars = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)
+        cars.reset(tracks)
+        return rollout(agent, cars, **limits)
+    envs = [make_env(fast=False) for _ in tracks]
+    try:
         pairs = zip(envs, tracks, strict=True)
         batch = EnvBatch(envs, [env.reset(seed=track)[0] for env, track in pairs])
-    return rollout(agent, batch, **limits)
+        return rollout(agent, batch, **limits)
+    finally:
+        for env in envs:
+            env.close()
 
 
 @torch.no_grad()
@@ -299,12 +298,7 @@ def encode_episode(vae: VAE, frames: np.ndarray, stride: int) -> np.ndarray:
 def remember_episode(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """M's memory before every frame of an episode, which C sees with that frame's z.
 
-    Args:
-        latents: float32 (T, latent_size).
-        actions: float32 (T, 3).
-
-    Returns:
-        float32 (T, hidden_size); zero in the first row.
+    float32 (T, latent_size) and (T, 3) -> (T, hidden_size); the first row is zero.
     """
     after, _ = mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None])
     return torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)[0].numpy()

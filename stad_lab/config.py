@@ -283,12 +283,6 @@ def check_together(config: Config) -> None:
         )
 
 
-def check_variant(variant: str) -> None:
-    """Raise ValueError unless `variant` is one of the four."""
-    if variant not in VARIANTS:
-        raise ValueError(f"unknown variant {variant!r}: choose one of {', '.join(VARIANTS)}")
-
-
 def check_same(path: Path, was: dict, now: dict) -> None:
     """Raise ValueError if what is in `path` was made with other values than `now` asks for.
 

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,6 +27,7 @@ import torch
 from filelock import FileLock
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
+import stad_lab.envs
 from stad_lab import Config, load_agent, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controller
@@ -102,9 +104,11 @@ def train_quickly(folder, guard):
     """Train with the quick preset under guard; returns what came of it."""
     guard.mkdir()
     (guard / "sitecustomize.py").write_text(GUARD)
+    compiled = Path(stad_lab.envs.__file__).parent / "__pycache__"  # where Numba keeps the engine
+    # PyTorch looks for a place for temporary files in /dev/ and /proc/, too.
+    may_write = [str(folder), str(guard), str(compiled), "/dev/", "/proc/"]
     guarded = {
-        # PyTorch looks for a place for temporary files in /dev/ and /proc/, too.
-        "GUARDED": os.pathsep.join([str(folder), str(guard), "/dev/", "/proc/"]),
+        "GUARDED": os.pathsep.join(may_write),
         "TMPDIR": str(guard),
         "PYTHONPATH": os.pathsep.join([str(guard), os.environ.get("PYTHONPATH", "")]),
         "PYTHONDONTWRITEBYTECODE": "1",

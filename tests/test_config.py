@@ -4,7 +4,6 @@ import dataclasses
 import inspect
 import itertools
 
-import numpy as np
 import pytest
 
 from stad_lab import Config
@@ -16,7 +15,6 @@ from stad_lab.config import (
     MDNRNNConfig,
     VAEConfig,
     check_same,
-    random_stream,
     track_seeds,
 )
 
@@ -165,13 +163,6 @@ def test_another_value_is_refused_and_one_that_did_not_exist_counts_as_its_defau
     ):
         with pytest.raises(ValueError, match=message):
             check_same(tmp_path, older, now)
-
-
-def test_random_streams_do_not_collide():
-    streams = [("vae", 0), ("vae", 0, 0), ("vae", 0, 1), ("vae", 1), ("mdn_rnn", 0), ("init", 0, 1)]
-    first = [random_stream(*stream).integers(2**63) for stream in streams]
-    assert len(set(first)) == len(streams)
-    assert np.array_equal(first, [random_stream(*stream).integers(2**63) for stream in streams])
 
 
 def test_no_two_uses_share_a_track():

@@ -146,7 +146,7 @@ def test_optional_libraries_may_be_missing_but_not_broken(monkeypatch):
 
 def test_a_black_picture_is_red(monkeypatch):
     black = np.zeros((96, 96, 3), np.uint8)
-    monkeypatch.setattr("stad_lab.envs.car_racing.FastCarRacing._render", lambda self, mode: black)
+    monkeypatch.setattr("stad_lab.envs.cars.Cars.draw", lambda *_: black[None])
     report = doctor.Report(tuple(doctor.check_drive()))
     assert (
         line(report, "fast renderer").state == "red"

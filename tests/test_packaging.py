@@ -135,7 +135,7 @@ def test_the_licences_of_all_that_is_installed_go_with_mit():
 
 @pytest.mark.long
 def test_with_the_core_alone_an_agent_drives_an_episode(tmp_path):
-    """A new environment with the core's packages, without the network's help if pip has a cache."""
+    """A new environment gets the core's packages, which takes minutes."""
     source = shutil.copytree(
         ROOT, tmp_path / "source", ignore=shutil.ignore_patterns(".*", "notebooks", "docs", "build")
     )

@@ -7,14 +7,6 @@ import time
 KILL = getattr(signal, "SIGKILL", signal.SIGTERM)  # on Windows, SIGTERM ends a process at once
 
 
-def die_once(marker, answer):
-    """A task whose first worker is killed."""
-    if not marker.exists():
-        marker.touch()
-        os.kill(os.getpid(), KILL)
-    return answer
-
-
 def always_die():
     """A task that no worker survives."""
     os.kill(os.getpid(), KILL)
@@ -25,8 +17,3 @@ def note(folder, number):
     (folder / str(number)).touch()
     time.sleep(0.2)
     return number
-
-
-def send_much():
-    """A task whose result takes long on its way to the parent."""
-    return bytes(300_000_000)

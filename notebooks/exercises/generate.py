@@ -1,6 +1,6 @@
-"""Make the student's versions from the instructor's, with nbgrader: python notebooks/exercises/generate.py.
+"""Make the student's versions from the instructor's: python notebooks/exercises/generate.py.
 
-Each source/NAME/NAME.ipynb becomes NAME.ipynb in this folder: solutions give way to stubs, outputs go.
+nbgrader makes NAME.ipynb of each source/NAME/NAME.ipynb: stubs for solutions, and no outputs.
 """
 
 import os

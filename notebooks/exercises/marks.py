@@ -1,8 +1,8 @@
-"""Print the marks of an assignment that nbgrader has graded, as CSV: python marks.py 01_difference_images.
+"""Print the marks of a graded assignment as CSV: python marks.py 01_difference_images.
 
-Run it in the folder of the course, where nbgrader keeps its gradebook. The machine's points count half, because the
-checks and the model answers are public; the points that a person has given count in full. A mark is final when `unread`
-is 0: so many answers of the student wait for a person.
+Run it in the folder of the course, where nbgrader keeps its gradebook. The machine's points count
+half, because the checks and the model answers are public; a person's points count in full. A mark
+is final when `unread` is 0: so many answers of the student wait for a person.
 """
 
 import argparse
@@ -14,9 +14,9 @@ from nbgrader.api import Gradebook, MissingEntry
 
 
 def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]]:
-    """The points of an assignment: student -> (the machine's, a person's, how many answers are unread).
+    """Points of an assignment: student -> (the machine's, a person's, number of unread answers).
 
-    A person's word replaces the machine's, and extra credit is a person's, too.
+    A person's points replace the machine's, and extra credit is a person's, too.
     """
     found = {}
     for submission in gradebook.notebook_submissions(name, name):
@@ -35,11 +35,10 @@ def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]
 
 
 def read_marks(name: str) -> dict[str, tuple[float, float, int]]:
-    """The marks in the gradebook of this folder. Ends the program if there is none, or no such assignment in it."""
+    """The marks in this folder's gradebook; without it, or the assignment, the program ends."""
     if not Path("gradebook.db").exists():
-        sys.exit(
-            f"no gradebook.db in {Path.cwd()}: go to the folder of the course, where nbgrader has graded"
-        )
+        where = "go to the folder of the course, where nbgrader has graded"
+        sys.exit(f"no gradebook.db in {Path.cwd()}: {where}")
     with Gradebook("sqlite:///gradebook.db") as gradebook:
         try:
             gradebook.find_assignment(name)

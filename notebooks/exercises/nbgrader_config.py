@@ -1,4 +1,4 @@
-"""The course for nbgrader: `nbgrader generate_assignment 01_difference_images` in this folder, and so on."""
+"""The course for nbgrader, which reads this file when it is called in this folder."""
 
 from pathlib import Path
 
@@ -14,7 +14,8 @@ from nbgrader.preprocessors import (
 class DropRepeated(DeduplicateIds):
     """Takes a cell that a student has copied or split as one of the student's own.
 
-    nbgrader empties its metadata, takes that for an old notebook's, and leaves this student and all after it ungraded.
+    nbgrader empties its metadata, takes that for an old notebook's, and leaves this student and all
+    after it ungraded.
     """
 
     def preprocess_cell(self, cell, resources, cell_index):
@@ -25,7 +26,7 @@ class DropRepeated(DeduplicateIds):
         return cell, resources
 
 
-c = get_config()
+c = get_config()  # noqa: F821 (nbgrader runs this file with get_config in its globals)
 
 c.CourseDirectory.course_id = "stad_lab"
 c.CourseDirectory.root = str(Path(__file__).parent)

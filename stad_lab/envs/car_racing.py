@@ -12,7 +12,7 @@ from gymnasium.envs.box2d import car_racing as reference
 from stad_lab.envs import physics, picture
 from stad_lab.envs.cars import Cars, road_polygons
 from stad_lab.envs.frames import OBSERVATION_SHAPE
-from stad_lab.envs.track import tile_colors
+from stad_lab.envs.track import TRACK_WIDTH, tile_colors
 
 MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 FAST_ID = "StadLab/CarRacing-v3"
@@ -32,6 +32,34 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
         [-1, 1], gas and brake in [0, 1]. An episode is cut at 1,000 frames.
     """
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
+
+
+def place_car(
+    env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, offset: float = 0.0
+) -> np.ndarray:
+    """Put the car on a tile of its track, moving; returns the observation there.
+
+    Args:
+        env: from `make_env`, fast or not.
+        tile, speed, turn, offset: as for `Cars.place`.
+    """
+    racing = env.unwrapped
+    if isinstance(racing, CarRacing):
+        return racing.place(tile, speed=speed, turn=turn, offset=offset)
+    _, beta, x, y = racing.track[tile % len(racing.track)]
+    heading, across = beta + turn, offset * TRACK_WIDTH
+    racing.car.destroy()
+    place = x + across * np.cos(beta), y + across * np.sin(beta)
+    racing.car = car_dynamics.Car(racing.world, heading, *place)
+    for wheel, (left, ahead) in zip(racing.car.wheels, car_dynamics.WHEELPOS, strict=True):
+        # Gymnasium places the wheels as if the car faced north.
+        corner = left * car_dynamics.SIZE, ahead * car_dynamics.SIZE
+        wheel.position = racing.car.hull.GetWorldPoint(corner)
+        wheel.omega = speed / wheel.wheel_rad
+    for body in racing.car.drawlist:
+        body.linearVelocity = (-np.sin(heading) * speed, np.cos(heading) * speed)
+    racing.t = max(racing.t, 1.0)  # the opening zoom is over
+    return racing._render("state_pixels")
 
 
 def spaces(continuous: bool = True) -> tuple[gym.Space, gym.Space]:
@@ -108,6 +136,16 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         info = {"lap_finished": bool(ending == physics.LAP_FINISHED)} if ended[0] else {}
         self._show()
         return self.cars.draw()[0], float(rewards[0]), bool(ended[0]), False, info
+
+    @property
+    def track(self) -> np.ndarray:
+        """The centre line, float64 (tiles, 4): angle from the origin, heading, x and y."""
+        return self.cars.tracks[0].path
+
+    @property
+    def position(self) -> np.ndarray:
+        """Where the hull is, world units, float64 (2,)."""
+        return self.cars.cars["position"][0, 0].astype(float)
 
     def place(self, tile: int, *how: float, **named: float) -> np.ndarray:
         """Put the car on a tile, as `Cars.place`; returns the observation there."""

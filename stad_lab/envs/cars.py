@@ -42,6 +42,7 @@ class Cars:
         roads: `physics.ROAD` (count,), the tiles of each track, and which were visited.
         tracks: the Track of each car.
         randoms: the random generator of each car, Gymnasium's `np_random`.
+        ground: the painted tracks, a `picture.Ground`; None before the first `draw`.
         colors: "road", "background" and "grass", float64 (count, 3), 0 to 255.
     """
 
@@ -66,7 +67,7 @@ class Cars:
         }
         self._tiles = np.zeros((count, MAX_TILES, 4, 2))
         self._painted = np.zeros(count, bool)
-        self._ground: picture.Ground | None = None
+        self.ground: picture.Ground | None = None
         for car in range(count if domain_randomize else 0):
             self._draw_colors(car)
 
@@ -123,14 +124,14 @@ class Cars:
     def draw(self, which: np.ndarray | None = None) -> np.ndarray:
         """What cars see, uint8 (n, 96, 96, 3) or (n, 64, 64, 3); `which` as for `step`."""
         which = self._numbers(which)
-        if self._ground is None:
-            self._ground = picture.make_ground(len(self))
+        if self.ground is None:
+            self.ground = picture.make_ground(len(self))
         for car in which[~self._painted[which]]:
             self._paint(car)
         size = SIZES[self.shows]
         out = np.empty((len(which), size, size, 3), np.uint8)
         arrays = which, self.cars, self.roads, self._tiles
-        picture.draw_cars(out, self._ground, picture.make_pictures(), *arrays, self.bar)
+        picture.draw_cars(out, self.ground, picture.make_pictures(), *arrays, self.bar)
         return out
 
     def place(
@@ -172,7 +173,7 @@ class Cars:
     def _paint(self, car: int) -> None:
         polygons, kinds = road_polygons(self.tracks[car])
         colors = [self.colors[name][car] for name in ("background", "grass", "road")]
-        picture.paint(self._ground, car, polygons, kinds, picture.ground_colors(*colors))
+        picture.paint(self.ground, car, polygons, kinds, picture.ground_colors(*colors))
         road = self.roads[car : car + 1]["darkened"]
         road[road == 2] = 1  # what an earlier picture of this episode had painted
         self._painted[car] = True

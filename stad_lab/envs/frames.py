@@ -28,7 +28,7 @@ def to_frame(observation: np.ndarray, crop_bar: bool = True) -> np.ndarray:
         uint8 (64, 64, 3).
 
     Raises:
-        ValueError: wrong shape or dtype.
+        ValueError: another shape or dtype.
     """
     check_observation(observation)
     picture = observation[:BAR_TOP] if crop_bar else observation
@@ -41,17 +41,7 @@ def normalise(frames: np.ndarray) -> np.ndarray:
 
 
 def difference_image(frame: np.ndarray, earlier: np.ndarray) -> np.ndarray:
-    """d = frame - earlier (STAD, section 3.1), of one frame or of many.
-
-    Args:
-        frame, earlier: uint8 of one shape.
-
-    Returns:
-        float32 in [-1, 1] of that shape.
-
-    Raises:
-        ValueError: shapes that differ, or another dtype.
-    """
+    """d = frame - earlier: uint8 of one shape -> float32 in [-1, 1]. Raises as `to_pictures`."""
     return to_pictures(frame, earlier)[1]
 
 
@@ -61,6 +51,9 @@ def to_pictures(frames: np.ndarray, earlier: np.ndarray) -> tuple[np.ndarray, np
     Args:
         frames: uint8, for example (batch, 64, 64, 3).
         earlier: the frames `stride` before them, of the same shape.
+
+    Raises:
+        ValueError: shapes that differ, or another dtype.
     """
     if frames.shape != earlier.shape or frames.dtype != np.uint8 or earlier.dtype != np.uint8:
         raise ValueError(
@@ -92,11 +85,7 @@ def episode_differences(frames: np.ndarray, stride: int) -> np.ndarray:
 
 
 class FrameMemory:
-    """The last frames of one car or of a batch of cars, from which difference images are made.
-
-    Frames may have any shape, for example (64, 64, 3) or (cars, 64, 64, 3). A new episode begins
-    with a new memory.
-    """
+    """The last frames of an episode, (64, 64, 3) or (cars, 64, 64, 3), for difference images."""
 
     def __init__(self, stride: int):
         check_stride(stride)

@@ -185,6 +185,13 @@ def ground_colors(background: np.ndarray, grass: np.ndarray, road: np.ndarray) -
     return np.array([[max(0, int(c) - DARKENING) for c in color] for color in colors], np.uint8)
 
 
+def texture(ground: Ground, car: int) -> np.ndarray:
+    """The painted ground of a car in colour, north up, uint8 (SIZE, SIZE, 3): to look at."""
+    lanes = ground.palette[car][ground.texels[car, ::-1]]
+    channels = [(lanes >> np.uint64(shift)) & np.uint64(0xFF) for shift in (0, 16, 32)]
+    return np.stack(channels, axis=-1).astype(np.uint8)
+
+
 # Painting
 
 

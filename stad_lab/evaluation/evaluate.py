@@ -39,7 +39,8 @@ def evaluate(
         source: of the agent, as for `load_agent`.
         episodes: number of tracks, each driven once, to its end.
         fast: render with the fast renderer instead of Gymnasium's own.
-        processes: workers: threads, or processes for Gymnasium's renderer; the numbers do not depend on them.
+        processes: threads, or processes for Gymnasium's renderer; the numbers do not depend on
+            them.
         executor: who drives; None for so many workers of this machine.
         unfinished: file that keeps what was driven, so that an interrupted evaluation continues.
 

@@ -34,8 +34,15 @@ from stad_lab.training.evolution import (
     validate,
 )
 from stad_lab.training.mdn_rnn import check_mdn_rnn
-from stad_lab.training.pipeline import GIVE_A_RUN, MACHINE, PACKAGES, RECORD, provenance, starts
-from stad_lab.training.pipeline import refuse_first_edition as refuse
+from stad_lab.training.pipeline import (
+    GIVE_A_RUN,
+    MACHINE,
+    PACKAGES,
+    RECORD,
+    check_record,
+    provenance,
+    starts,
+)
 
 AGAIN = 3  # recorded episodes that are driven again
 MISSING = "none: trained elsewhere or not yet"
@@ -57,7 +64,7 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         ValueError: the record itself is damaged.
     """
     folder = Path(folder)
-    refuse(folder)
+    check_record(folder)
     record = load_json(folder / RECORD, GIVE_A_RUN, kind="record")
     config = Config.from_dict(record["config"])
     checks: dict[str, Callable[[], str]] = {

@@ -17,7 +17,6 @@ from distributed.comm import get_address_host_port, parse_address
 from stad_lab.io.workers import task_errors
 
 PATIENCE = 60.0  # seconds to wait for a scheduler to answer, and for its first worker
-# Other versions would give other numbers.
 SAME = ("stad_lab", "torch", "numpy", "gymnasium", "box2d", "pygame-ce", "opencv-python-headless")
 REMEDY = "install the same environment.txt on all machines"
 
@@ -70,9 +69,7 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
         try:
             check_versions(client.run(versions))
         except ImportError as error:
-            raise ValueError(
-                f"a worker of {address} lacks a package ({error}): {REMEDY}"
-            ) from error
+            raise ValueError(f"worker of {address} lacks a package ({error}): {REMEDY}") from error
         # Dask's memory manager drops copies that no waiting task needs: V and M, between two calls.
         managed = client.amm.running()
         client.amm.stop()

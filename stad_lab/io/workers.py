@@ -99,6 +99,24 @@ def worker_threads(count: int, given: Executor | None = None) -> Iterator[Execut
         torch.set_num_threads(threads)  # tasks set it to 1, for all threads that come later
 
 
+class WorkerProcesses(ProcessPoolExecutor):
+    """A pool of processes that must load the same stad_lab as their parent."""
+
+    def submit(self, function: Callable, /, *arguments, **named) -> Future:
+        """As for every Executor."""
+        return super().submit(run_here, stad_lab.__file__, function, *arguments, **named)
+
+
+def run_here(home: str, function: Callable, *arguments, **named) -> object:
+    """Call a function in a worker; ValueError if it has loaded another stad_lab than `home`."""
+    if stad_lab.__file__ != home:
+        raise ValueError(
+            f"a worker process loaded {stad_lab.__file__}, its parent {home}: install the one that"
+            " you use instead of changing sys.path"
+        )
+    return function(*arguments, **named)
+
+
 @contextmanager
 def worker_processes(count: int, given: Executor | None = None) -> Iterator[Executor]:
     """A pool of `count` fresh processes for a `with` block; or the given executor.
@@ -119,7 +137,7 @@ def worker_processes(count: int, given: Executor | None = None) -> Iterator[Exec
         context.set_forkserver_preload(PRELOADED)
     count = min(check_count(count), 61) if sys.platform == "win32" else check_count(count)
     others = set(multiprocessing.active_children())
-    executor = ProcessPoolExecutor(count, context, start_worker, (stad_lab.__file__,))
+    executor = WorkerProcesses(count, context, start_worker)
     try:
         yield executor
     except BaseException:
@@ -140,15 +158,8 @@ def check_script() -> None:
         )
 
 
-def start_worker(home: str) -> None:
-    """Prepare a worker process, which must have loaded the same stad_lab as its parent."""
-    if stad_lab.__file__ != home:
-        print(
-            f"error: a worker process loaded {stad_lab.__file__}, its parent {home}: install the"
-            " one that you use instead of changing sys.path",
-            file=sys.stderr,
-        )
-        os._exit(1)
+def start_worker() -> None:
+    """Prepare a worker process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     single_thread()
     threading.Thread(target=end_with_parent, daemon=True).start()

@@ -80,8 +80,7 @@ def describe_experiment(name: str, episodes: pandas.DataFrame, runs: pandas.Data
 def compare_recipe(returns: dict[str, np.ndarray], recipe: str) -> dict:
     """The four variants of a recipe, and the difference of three of them to `frame`.
 
-    "interval" is Student's t of the run means, the variance pooled over all four variants;
-    "bootstrap_interval" resamples seeds and tracks.
+    "interval" is Student's t of the run means, the variance pooled over all four variants.
     """
     scores = [returns[f"{recipe}_{variant}"] for variant in VARIANTS]
     runs = [own.mean(axis=1) for own in scores]
@@ -151,10 +150,7 @@ def describe_agents() -> dict:
 def learning_curve(
     runs: pandas.DataFrame, generations: pandas.DataFrame, experiment: str, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Episodes driven so far, and score, at each validation of a run: two arrays (validations,).
-
-    All episodes count: those of the dataset, of earlier runs, and of the validations.
-    """
+    """All episodes driven so far, and score, at each validation of a run: arrays (validations,)."""
     named = f"experiment == {experiment!r} and role == 'run' and seed == {seed}"
     run, log = runs.query(named).iloc[0], generations.query(named)
     population, tracks, validations = (

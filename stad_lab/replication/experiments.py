@@ -24,17 +24,17 @@ RECIPES = {  # each is run with all four variants, as the experiments RECIPE_VAR
 }
 
 
-def evolution(**changes) -> dict:
-    """Changes of the settings of CMA-ES, for `Config.replace`."""
-    return {"evolution": changes}
-
-
-SECOND_ITERATION = evolution(generations=40, sigma=0.05, replay_share=0.5)
-SECOND_ITERATION |= {"data": {"agent_episodes": 110}}
-EARLY_RECIPE = {"data": {"crop_bar": True}} | evolution(
-    population=16, tracks=4, replay_share=0.0,
-    components=0, sigma_decay=0.0, step_size_rule="TPA",
-)  # fmt: skip
+SECOND_ITERATION = {
+    "data": {"agent_episodes": 110},
+    "evolution": {"generations": 40, "sigma": 0.05, "replay_share": 0.5},
+}
+EARLY_RECIPE = {
+    "data": {"crop_bar": True},
+    "evolution": {
+        "population": 16, "tracks": 4, "replay_share": 0.0,
+        "components": 0, "sigma_decay": 0.0, "step_size_rule": "TPA",
+    },
+}  # fmt: skip
 # Single changes of "one_iteration": the experiment whose dataset, V and M are shared (None: own
 # ones) -> experiment -> (what it is, the change). The variant is `input`.
 CHANGES = {
@@ -44,17 +44,23 @@ CHANGES = {
         **{f"latent_{n}": (f"{n} latents", {"vae": {"latent_size": n}}) for n in (16, 64)},
     },
     "one_iteration": {
-        "z_only": ("C sees z alone", evolution(features="z")),
-        "h_only": ("C sees h alone", evolution(features="h")),
+        "z_only": ("C sees z alone", {"evolution": {"features": "z"}}),
+        "h_only": ("C sees h alone", {"evolution": {"features": "h"}}),
         "untrained_mdn_rnn": ("M is not trained", {"mdn_rnn": {"steps": 0}}),
-        "small_population": ("16 agents on 4 tracks each", evolution(population=16, tracks=4)),
+        "small_population": (
+            "16 agents on 4 tracks each", {"evolution": {"population": 16, "tracks": 4}}
+        ),
     },
     "another_seed": {
-        "last_mean": ("the last CMA mean, not an average", evolution(averaged_share=0.0)),
-        "all_weights": ("all weights searched", evolution(components=0, step_size_rule="TPA")),
-        "adaptive_sigma": ("step size adapted by CMA-ES", evolution(sigma_decay=0.0)),
+        "last_mean": (
+            "the last CMA mean, not an average", {"evolution": {"averaged_share": 0.0}}
+        ),
+        "all_weights": (
+            "all weights searched", {"evolution": {"components": 0, "step_size_rule": "TPA"}}
+        ),
+        "adaptive_sigma": ("step size adapted by CMA-ES", {"evolution": {"sigma_decay": 0.0}}),
     },
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -72,16 +78,16 @@ class Experiment:
     def config_of(self, seed: int) -> Config:
         """The configuration of one seed."""
         own = seed if self.retrained else self.config.seed
-        return self.config.replace(seed=own, **evolution(seed=seed))
+        return self.config.replace(seed=own, evolution={"seed": seed})
 
 
 def make_experiments() -> dict[str, Experiment]:
     """All experiments by name."""
     found = {}
     for name in VARIANTS:
-        paper = Config.preset("paper", variant=name, **evolution(step_size_rule="TPA"))
+        paper = Config.preset("paper", variant=name, evolution={"step_size_rule": "TPA"})
         no_bar = Config.preset("laptop", variant=name)
-        first = no_bar.replace(data={"crop_bar": False}, **evolution(generations=15))
+        first = no_bar.replace(data={"crop_bar": False}, evolution={"generations": 15})
         two = first.replace(**SECOND_ITERATION)
         tuned, base = two.replace(**FINE_TUNING), f"two_iterations_{name}"
         for recipe, fields in {
@@ -93,13 +99,13 @@ def make_experiments() -> dict[str, Experiment]:
         }.items():
             found[f"{recipe}_{name}"] = Experiment(RECIPES[recipe], **fields)
     base = found["two_iterations_input"]
-    one_iteration = base.first.replace(**evolution(generations=55))
+    one_iteration = base.first.replace(evolution={"generations": 55})
     found["one_iteration"] = Experiment("one iteration", one_iteration)
     for world_model, changed in CHANGES.items():
         for name, (about, changes) in changed.items():
             config = found[world_model or "one_iteration"].config.replace(**changes)
             found[name] = Experiment(about, config, None, (0,), world_model)
-    only_new, about = base.config.replace(**evolution(replay_share=0.0)), "two iterations, "
+    only_new, about = base.config.replace(evolution={"replay_share": 0.0}), "two iterations, "
     early = [one.replace(**EARLY_RECIPE) for one in (base.config, base.first)]
     return found | {
         "no_replay": Experiment(about + "new tracks only", only_new, base.first, (0,)),

@@ -22,11 +22,17 @@ import torch
 from stad_lab.agent import PRETRAINED, load_agent, remember_episode, run_folder
 from stad_lab.config import VARIANTS, Config, check_same, random_stream, track_seeds
 from stad_lab.envs.frames import earlier_frames
-from stad_lab.evaluation import metrics, trajectories
-from stad_lab.evaluation.metrics import predict
+from stad_lab.evaluation import metrics
 from stad_lab.evaluation.probe import probe
 from stad_lab.evaluation.statistics import bootstrap
-from stad_lab.evaluation.trajectories import MOTION, Trajectory, encode_trajectory
+from stad_lab.evaluation.trajectories import (
+    MOTION,
+    Trajectory,
+    encode_trajectory,
+    record_random_trajectory,
+    record_trajectory,
+    road_in_sight,
+)
 from stad_lab.io import weights
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.weights import WorldModel, load_world_model
@@ -83,10 +89,7 @@ class Encoder(NamedTuple):
 def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[str]) -> dict:
     """Measure some of PARTS, and write each into `work/latents.json` as soon as it is measured.
 
-    The dataset is collected if it is not there.
-
-    Returns:
-        A dict for JSON: for each part what was found, its "config" and what it was "made_with".
+    The dataset is collected if it is not there. Returns what is written, part by part.
     """
     if unknown := [part for part in parts if part not in PARTS]:
         raise ValueError(f"unknown part {unknown[0]!r}: choose from {', '.join(PARTS)}")
@@ -96,9 +99,9 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[st
     study, file, result = Study(config, dataset_folder, work, driven), work / "latents.json", {}
     for name in parts:
         found = PARTS[name](study)
-        made_with = provenance(f"python -m stad_lab latents --parts {name} --out ...")
-        about = {"trajectories": len(driven), "config": config.as_dict(), "made_with": made_with}
-        result[name] = found | about
+        found |= {"trajectories": len(driven), "config": config.as_dict()}
+        found["made_with"] = provenance(f"python -m stad_lab latents --parts {name} --out ...")
+        result[name] = found
         save_json(file, (load_json(file) if file.exists() else {}) | result)
     return result
 
@@ -108,8 +111,7 @@ def random_trajectories(count: int, seed: int, processes: int) -> list[Trajector
     data = {"episodes": count, "episode_frames": RANDOM_FRAMES, "random_starts": 1.0}
     tasks = [(Config(seed=seed).replace(data=data), index) for index in range(count)]
     with worker_threads(processes) as executor:
-        record = trajectories.record_random_trajectory
-        return run_in_order(executor, record, tasks, "random trajectories")
+        return run_in_order(executor, record_random_trajectory, tasks, "random driver")
 
 
 def two_drivers(driven: list[Trajectory], processes: int) -> Drivers:
@@ -117,8 +119,7 @@ def two_drivers(driven: list[Trajectory], processes: int) -> Drivers:
     tracks = track_seeds("inspect", max(FEWEST, len(driven) // 3), 2)
     tasks = [(load_agent(AGENT), track, AGENT_FRAMES) for track in tracks]
     with worker_threads(processes) as executor:
-        record = trajectories.record_trajectory
-        by_agent = run_in_order(executor, record, tasks, "agent trajectories")
+        by_agent = run_in_order(executor, record_trajectory, tasks, "trained agent")
     return {"random driver": (driven, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
 
 
@@ -138,8 +139,8 @@ def probe_part(study: Study) -> dict:
     for prefix in ("cropped_", ""):
         for variant, model in shipped(prefix):
             memories = {"z, h": model.mdn_rnn, "z, h of an untrained M": mdn_rnn}
-            encoder = Encoder(model.vae, model.stride, model.crop_bar, memories)
-            encoders[f"{prefix}{variant}"] = encoder
+            own = Encoder(model.vae, model.stride, model.crop_bar, memories)
+            encoders[f"{prefix}{variant}"] = own
     for name, vae in untrained.items():
         encoders[f"{name}, untrained"] = Encoder(vae, v.stride, config.data.crop_bar, {})
     for stride in STRIDES:
@@ -173,7 +174,7 @@ def probe_trajectories(driven: list[Trajectory], skip: int, encoder: Encoder) ->
     motion = np.concatenate([one.motion for one in driven])
     number = np.repeat(np.arange(len(driven)), [len(one) for one in driven])
     moment = np.concatenate([np.arange(len(one)) for one in driven])
-    kept = trajectories.road_in_sight(motion) & (moment >= skip)
+    kept = road_in_sight(motion) & (moment >= skip)
     result = {}
     for name, seen in features.items():
         found = probe(seen[kept], motion[kept], number[kept])
@@ -185,11 +186,7 @@ def probe_trajectories(driven: list[Trajectory], skip: int, encoder: Encoder) ->
 
 
 def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> dict:
-    """Probe V and M of one run for the true motion, under two drivers.
-
-    Args:
-        source: a shipped agent, or the folder of a run with V and M.
-        count: trajectories of the random driver.
+    """Probe V and M of a shipped agent or a run's folder, on `count` random trajectories.
 
     Returns:
         A dict for JSON: "variant", checksums of "vae" and "mdn_rnn", "trajectories", "drivers"
@@ -269,7 +266,7 @@ def mdn_rnn_part(study: Study) -> dict:
         z = sample_latents(mu, logvar, random_stream("heldout", 0))
         kl = kl_divergence(torch.from_numpy(mu), torch.from_numpy(logvar))
         active = kl.mean(dim=(0, 1)).numpy() > metrics.ACTIVE
-        mixture, some = predict(model.mdn_rnn, z, actions), mu[:DREAMERS]
+        mixture, some = metrics.predict(model.mdn_rnn, z, actions), mu[:DREAMERS]
         counts, _ = np.histogram(metrics.pit(mixture, z)[..., active], bins=20, range=(0, 1))
         dreamed = metrics.dream_open_loop(model.mdn_rnn, some, actions[:DREAMERS], AWAKE)
         nll = {"M": metrics.mixture_nll(mixture, z), **simple_predictions(z, actions)}
@@ -285,17 +282,10 @@ def mdn_rnn_part(study: Study) -> dict:
 
 
 def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
-    """Predictions beside M, on the second half of the trajectories: the simple ones need the first.
+    """Predictions beside M: name -> mean nats, its interval, and that of the difference to M.
 
-    All are judged on the same frames, those of the longest prediction, and on active latents only:
-    the others are noise.
-
-    Args:
-        nll: name -> nats (trajectories, frames, latent_size); "M" among them.
-        active: bool (latent_size,).
-
-    Returns:
-        Name -> {"nats": mean, "interval": of it, "more_than_M": interval of the difference}.
+    Their nll (trajectories, frames, latent_size) counts on the second half of the trajectories, as
+    the simple ones need the first, on frames that all predict, and where `active` (latent_size,).
     """
     frames = min(found.shape[1] for found in nll.values())
     means = {
@@ -330,35 +320,32 @@ def reduced_predictions(
     """NLL of M that lack something, trained like the whole one."""
     result, usual = {}, study.config.mdn_rnn
     for name, (changes, sees_actions) in REDUCED.items():
-        reduced = study.config.replace(variant=model.vae.variant, mdn_rnn=changes)
-        batch = usual.batch * usual.sequence // reduced.mdn_rnn.sequence
-        reduced = reduced.replace(mdn_rnn={"batch": batch})
+        batch = usual.batch * usual.sequence // changes.get("sequence", usual.sequence)
+        config = study.config.replace(variant=model.vae.variant, mdn_rnn={"batch": batch} | changes)
         path = study.work / name.replace(" ", "_") / weights.MDN_RNN_FILE
-        mdn_rnn = reduced_mdn_rnn(reduced, study.dataset, path, model, sees_actions)
-        if reduced.mdn_rnn.sequence > 1:
-            mixture = predict(mdn_rnn, z, actions * sees_actions)
+        if not path.exists():
+            train_reduced(config, study.dataset, path, model, sees_actions)
+        mdn_rnn, metadata = weights.load_mdn_rnn(path)
+        weights.check_belongs(path, metadata, vae=model.checksums["vae"])
+        check_same(path, metadata["mdn_rnn"], dataclasses.asdict(config.mdn_rnn))
+        if config.mdn_rnn.sequence > 1:
+            mixture = metrics.predict(mdn_rnn, z, actions * sees_actions)
             result[name] = metrics.mixture_nll(mixture, z)
         else:
             result[name] = metrics.single_step_nll(mdn_rnn, z, actions)
     return result
 
 
-def reduced_mdn_rnn(
+def train_reduced(
     config: Config, dataset_folder: Path, path: Path, model: WorldModel, sees_actions: bool
-) -> MDNRNN:
-    """An M for V of `model`, trained with actions or without; that in `path`, if it is there."""
-    vae = model.checksums["vae"]
-    if not path.exists():
-        dataset = Dataset(dataset_folder)
-        shown = [action * sees_actions for action in dataset.actions]
-        encoded = encode_dataset(model.vae, dataset, model.stride)
-        with torch_settings(config.seed, 1) as device:
-            latents = Latents(encoded, shown, dataset.first_heldout, vae)
-            fit_mdn_rnn(config, latents, path, device)
-    mdn_rnn, metadata = weights.load_mdn_rnn(path)
-    weights.check_belongs(path, metadata, vae=vae)
-    check_same(path, metadata["mdn_rnn"], dataclasses.asdict(config.mdn_rnn))
-    return mdn_rnn
+) -> None:
+    """Train an M for V of `model`, with actions or without, into the file `path`."""
+    dataset = Dataset(dataset_folder)
+    shown = [action * sees_actions for action in dataset.actions]
+    encoded = encode_dataset(model.vae, dataset, model.stride)
+    latents = Latents(encoded, shown, dataset.first_heldout, model.checksums["vae"])
+    with torch_settings(config.seed, 1) as device:
+        fit_mdn_rnn(config, latents, path, device)
 
 
 PARTS = {"probe": probe_part, "vae": vae_part, "mdn_rnn": mdn_rnn_part}

@@ -45,9 +45,9 @@ def yaw_rate_of_z(probe: pandas.DataFrame) -> dict:
 def describe_probe(probe: pandas.DataFrame) -> dict:
     """R2 by "DRIVER: WORLD_MODEL-SEED", features and quantity."""
     found = defaultdict(lambda: defaultdict(dict))
-    for line in probe.itertuples():
-        name = f"{line.driver}: {key(line.world_model, line.seed)}"
-        found[name][line.features][line.quantity] = line.r2
+    for one in probe.itertuples():
+        name = f"{one.driver}: {key(one.world_model, one.seed)}"
+        found[name][one.features][one.quantity] = one.r2
     return found
 
 
@@ -63,10 +63,8 @@ def describe_models(metrics: pandas.DataFrame) -> dict:
 def stage_minutes(runs: pandas.DataFrame, name: str) -> dict:
     """Minutes of each stage, from an empty folder to the evaluated agent of seed 0."""
     own = runs[(runs.experiment == name) & (runs.seed == 0)].filter(like="seconds.")
-    minutes = {column.removeprefix("seconds."): own[column].sum() / 60 for column in own}
-    return {
-        stage: float(value) for stage, value in (minutes | {"all": sum(minutes.values())}).items()
-    }
+    minutes = (own.sum() / 60).rename(lambda column: column.removeprefix("seconds."))
+    return {**minutes.to_dict(), "all": float(minutes.sum())}
 
 
 def describe_speed(speed: pandas.DataFrame) -> dict:

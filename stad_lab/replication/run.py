@@ -48,21 +48,14 @@ Seeds = Sequence[int] | None
 
 
 def replicate(
-    name: str,
-    folder: str | Path,
-    executor: Executor | None = None,
-    seeds: Seeds = None,
+    name: str, folder: str | Path, executor: Executor | None = None, seeds: Seeds = None
 ) -> dict:
-    """Run an experiment, or what is missing of it; call it again to continue.
+    """Run what is missing of an experiment in `folder/name`; returns the summary of its returns.
 
     Args:
         name: one of EXPERIMENTS or BASELINE_DRIVERS.
-        folder: of all experiments; this one goes into `folder/name`.
         executor: who drives; None for processes of this machine.
-        seeds: some of the experiment's seeds; None for all. A baseline driver has none.
-
-    Returns:
-        The summary of the returns of these seeds.
+        seeds: of a baseline driver there are none.
 
     Raises:
         ValueError: an unknown experiment or seed, or a folder with something else in it.
@@ -131,10 +124,7 @@ class ConstantDriver(RandomDriver):
 
 
 def drive_blindly(name: str, track: int) -> tuple[float, int]:
-    """Drive a track as a baseline driver: (return, frames). Runs in a worker.
-
-    Rewards do not depend on the renderer, so the fast one serves.
-    """
+    """Drive a track as a baseline driver: (return, frames). Runs in a worker."""
     kind = RandomDriver if name == "random_driver" else ConstantDriver
     driver, cars = kind(random_stream("random driver", 0, track)), Cars(1, "frame")
     cars.reset([track])
@@ -146,18 +136,16 @@ def train_world_model(
     experiment: Experiment, folder: Path, executor: Executor | None
 ) -> tuple[Path | None, Path]:
     """Make an experiment's dataset, V and M, and before them its first run: both folders."""
-    first, world = folder / "first" if experiment.first else None, folder / "world"
+    first, world = None, folder / "world"
     if experiment.first:
+        first = folder / "first"
         train(experiment.first, first, executor=executor)
     train(experiment.config, world, until="mdn_rnn", executor=executor, earlier=first)
     return first, world
 
 
 def share_world_model(config: Config, run: Path, world: Path) -> None:
-    """Copy V and M into a run, and the components and first C that another seed has computed.
-
-    Those depend on V and M alone, so they are taken from seeds that have these V and M.
-    """
+    """Copy V and M into a run, with the components and first C of a seed that has this V and M."""
     run.mkdir(parents=True, exist_ok=True)
     trained = (VAE_FILE, MDN_RNN_FILE) if config.mdn_rnn.steps else (VAE_FILE,)
     for other in [world, *run.parent.glob("seed*")]:
@@ -178,17 +166,12 @@ def evaluate_run(folder: Path, executor: Executor | None) -> None:
     unfinished.unlink(missing_ok=True)
 
 
-def keep(
-    name: str,
-    folder: str | Path,
-    seeds: Seeds = None,
-    to: Path = tables.DATA,
-) -> list[str]:
+def keep(name: str, folder: str | Path, seeds: Seeds = None, to: Path = tables.DATA) -> list[str]:
     """Add the finished seeds of an experiment to the tables; returns their names.
 
-    With them go its first run and its world model, under the lowest of these seeds.
+    Its first run and its world model are added under the lowest of these seeds.
     """
-    own, kept = Path(folder) / name, []
+    own = Path(folder) / name
     wanted = [0] if is_baseline(name, seeds) else find_experiment(name, seeds).seeds
     finished = [seed for seed in wanted if (own / f"seed{seed}" / EVALUATION).exists()]
     for part, role in (("first", "first_iteration"), ("world", "world_model")):
@@ -196,8 +179,7 @@ def keep(
             tables.add_run(own / part, name, min(finished), to, role)
     for seed in finished:
         tables.add_run(own / f"seed{seed}", name, seed, to)
-        kept.append(tables.key(name, seed))
-    return kept
+    return [tables.key(name, seed) for seed in finished]
 
 
 def describe_time(name: str, seeds: Seeds = None) -> str:

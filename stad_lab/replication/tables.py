@@ -34,11 +34,7 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
 
 
 def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
-    """Read a table.
-
-    Raises:
-        ValueError: a column is missing or has gaps, or a line is there twice.
-    """
+    """Read a table; ValueError if a column is missing or has gaps, or a line is there twice."""
     (keys, values), path = TABLES[name], folder / f"{name}.csv"
     table = pandas.read_csv(path, low_memory=False)  # exact from pandas 3.1 on
     for column in keys + values:
@@ -50,11 +46,7 @@ def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
 
 
 def episodes(folder: Path = DATA) -> pandas.DataFrame:
-    """The evaluation of each run: `return` and `frames` on every official track.
-
-    Raises:
-        ValueError: as `read`, or an evaluation that is not on the tracks 0 to 99.
-    """
+    """The evaluation of each run: `return` and `frames` on every official track."""
     table = read("episodes", folder)
     for (experiment, seed), run in table.groupby(["experiment", "seed"]):
         check_tracks(f"{experiment}, seed {seed}", run["track"])
@@ -90,9 +82,7 @@ def key(experiment: str, seed: int, role: str = "run") -> str:
 def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str = "run") -> None:
     """Add the records of a finished run to the tables, in place of those that it has there.
 
-    Raises:
-        ValueError: a damaged file, or an evaluation of another variant, renderer, controller or
-            of other tracks.
+    Raises ValueError for an evaluation of another variant, renderer, controller or tracks.
     """
     run = dict(zip(RUN, (experiment, role, seed), strict=True))
     line = run | describe_record(load_json(folder / "record.json"))

@@ -20,6 +20,7 @@ from stad_lab.io.weights import (
     CONTROLLER_FILE,
     MDN_RNN_FILE,
     VAE_FILE,
+    check_belongs,
     load_controller,
     load_world_model,
 )
@@ -98,7 +99,8 @@ def begin(config: Config, earlier: Path, folder: Path) -> bool:
         if (earlier / name).exists() and not (folder / name).exists():
             copy_file(earlier / name, folder)
     path, world_model = folder / START_FILE, load_world_model(folder)
-    parameters, _ = load_controller(earlier / CONTROLLER_FILE)
+    parameters, metadata = load_controller(earlier / CONTROLLER_FILE)
+    check_belongs(earlier / CONTROLLER_FILE, metadata, **world_model.checksums)
     if path.exists():
         if not np.array_equal(load_start(path, world_model), parameters):
             raise ValueError(f"{folder} continues from another C than that of {earlier}")

@@ -148,7 +148,7 @@ def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) 
 
 def check_stages(config: Config, folder: Path, data: Path) -> None:
     """Raise ValueError, before any work, if a finished stage in the folder is of another run."""
-    refuse_first_edition(folder)
+    check_record(folder)
     if not config.data.agent_episodes:
         read_manifest(data, made_with(config))
     if (folder / VAE_FILE).exists():
@@ -160,14 +160,17 @@ def check_stages(config: Config, folder: Path, data: Path) -> None:
             read_log(config, folder, load_world_model(folder))
 
 
-def refuse_first_edition(folder: Path) -> None:
-    """Raise ValueError if a folder holds a run of stad_lab 0.1."""
+def check_record(folder: Path) -> None:
+    """Raise ValueError if a folder holds a run of stad_lab 0.1, or a record of no run."""
     path = folder / RECORD
-    if path.exists() and "settings" in load_json(path):
+    record = load_json(path) if path.exists() else {"config": {}}
+    if "settings" in record:
         raise ValueError(
             f"{folder} holds a run of stad_lab 0.1: continue it with that version, or choose"
             " another folder"
         )
+    if "config" not in record:
+        raise ValueError(f"{path} is of {record.get('variant')!r}, no run: choose another folder")
 
 
 def run_stages(
@@ -181,7 +184,8 @@ def run_stages(
     """Run some stages in order and keep the record of the run; False if nothing was to do."""
     worked = False
     with locked(folder):
-        record = open_record(config, folder, before)
+        command = command_of(config) if data else fine_tuning_command(config)
+        record = open_record(config, folder, before, command)
         for name, stage in stages.items():
             with timed(record, name, folder) as note:
                 try:
@@ -228,13 +232,13 @@ def timed(record: dict, stage: str, folder: Path) -> Iterator[Callable[[], None]
         thread.join()
 
 
-def open_record(config: Config, folder: Path, before: dict | None) -> dict:
+def open_record(config: Config, folder: Path, before: dict | None, command: str) -> dict:
     """The record of the run in `folder`, or a new one.
 
     "made_with" is that of the first start; a later one on another machine or with other versions
     is added to "continued_with". "earlier" is the record of the run that this one continues.
     """
-    path, made = folder / RECORD, provenance(command_of(config))
+    path, made = folder / RECORD, provenance(command)
     new = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
     if not path.exists():
         earlier = {} if before is None else {"earlier": before}
@@ -262,7 +266,7 @@ def read_finished(earlier: Path) -> dict:
         ValueError: it has not, or a file is damaged.
         FileNotFoundError: there is no run, or no log.
     """
-    refuse_first_edition(earlier)
+    check_record(earlier)
     record = load_json(earlier / RECORD, GIVE_A_RUN)
     log = load_json(earlier / LOG, GIVE_A_RUN)
     done, asked = len(log["generations"]), log["evolution"]["generations"]
@@ -284,6 +288,13 @@ def command_of(config: Config) -> str:
     command = f"python -m stad_lab train {name} --variant {config.variant} --out ..."
     earlier = ["--earlier ..."] if config.data.agent_episodes else []
     return " ".join([command, *options, *earlier])
+
+
+def fine_tuning_command(config: Config) -> str:
+    """The command line that makes a fine-tuning of this configuration."""
+    names = ("generations", "sigma", "seed")
+    options = [option_of(name, getattr(config.evolution, name)) for name in names]
+    return " ".join(["python -m stad_lab fine-tune --run ... --out ...", *options])
 
 
 def changes(config: Config, usual: Config) -> dict:

@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from stad_lab import make_env
 from stad_lab.agent import encode_episode, remember_episode
 from stad_lab.config import TRACK_RANGES, Config, track_seeds
-from stad_lab.envs.car_racing import TRACK_WIDTH, make_env, place_car
+from stad_lab.envs.cars import Cars
+from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.trajectories import (
     MOTION,
     Recorder,
@@ -30,24 +32,23 @@ def random_trajectory():
 
 
 @pytest.fixture
-def env():
-    """CarRacing on a track."""
-    env = make_env()
-    env.reset(seed=5)
-    yield env
-    env.close()
+def cars():
+    """One car on a track."""
+    cars = Cars(1)
+    cars.reset([5])
+    return cars
 
 
-def motion_of(env):
-    return dict(zip(MOTION, true_motion(env).tolist(), strict=True))
+def motion_of(cars):
+    return dict(zip(MOTION, true_motion(cars).tolist(), strict=True))
 
 
 @pytest.mark.parametrize(
     ("tile", "speed", "turn", "offset"), [(0, 0, 0, 0), (40, 50, 0.2, 0.5), (120, 20, -0.3, -0.6)]
 )
-def test_the_motion_is_that_which_the_car_was_given(tile, speed, turn, offset, env):
-    place_car(env, tile, speed, turn, offset)
-    motion = motion_of(env)
+def test_the_motion_is_that_which_the_car_was_given(tile, speed, turn, offset, cars):
+    cars.place(0, tile, speed, turn, offset)
+    motion = motion_of(cars)
     assert motion["forward speed"] == pytest.approx(speed, abs=0.01)
     assert motion["slip speed"] == pytest.approx(0, abs=0.01)
     assert motion["yaw rate"] == 0
@@ -55,15 +56,16 @@ def test_the_motion_is_that_which_the_car_was_given(tile, speed, turn, offset, e
     assert motion["heading error"] == pytest.approx(turn, abs=0.15)
 
 
-def test_speed_along_and_across_are_separate_and_left_is_positive(env):
-    place_car(env, 30, speed=40)
-    hull = env.unwrapped.car.hull
-    hull.linearVelocity = 3 * hull.GetWorldVector((0, 1)) + 4 * hull.GetWorldVector((1, 0))
-    speeds = [motion_of(env)[name] for name in ("forward speed", "slip speed")]
+def test_speed_along_and_across_are_separate_and_left_is_positive(cars):
+    cars.place(0, 30, speed=40)
+    angle = cars.cars["angle"][0, 0]
+    ahead, right = (-np.sin(angle), np.cos(angle)), (np.cos(angle), np.sin(angle))
+    cars.cars["velocity"][0, 0, :2] = 3 * np.array(ahead) + 4 * np.array(right)
+    speeds = [motion_of(cars)[name] for name in ("forward speed", "slip speed")]
     assert speeds == pytest.approx([3, 4], abs=1e-4)
     for _ in range(12):
-        env.step(np.array([-1, 0.2, 0], np.float32))  # steering to the left
-    motion = motion_of(env)
+        cars.step(np.array([[-1, 0.2, 0]]))  # steering to the left
+    motion = motion_of(cars)
     assert motion["yaw rate"] > 0.1 and motion["wheel angle"] > 0.1
 
 
@@ -99,8 +101,9 @@ def test_a_random_trajectory_is_as_in_the_dataset_but_on_a_track_of_its_own(
     assert TRACK_RANGES["inspect"][0] <= tracks[0] < TRACK_RANGES["inspect"][1]
 
 
-def test_an_agent_s_trajectory_is_recorded_as_it_was_driven(agent, env):
+def test_an_agent_s_trajectory_is_recorded_as_it_was_driven(agent):
     trajectory = record_trajectory(agent, track=4, frames=20)
+    env = make_env()
     observation, _ = env.reset(seed=4)
     agent.reset()
     for t in range(20):
@@ -115,7 +118,7 @@ def test_an_agent_s_trajectory_is_recorded_as_it_was_driven(agent, env):
 
 def test_a_trajectory_without_a_frame_is_refused():
     with pytest.raises(ValueError, match="without a frame: drive at least one frame"):
-        Recorder().trajectory([])
+        Recorder(Cars(1)).trajectory([])
 
 
 def test_an_inspection_is_what_the_agent_saw(agent):

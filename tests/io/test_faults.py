@@ -251,12 +251,21 @@ def test_a_run_of_the_first_edition_is_refused_with_the_version_that_continues_i
     save_json(folder / "record.json", record)
     before = snapshot(folder)
     error = f"{folder} holds a run of stad_lab 0.1: continue it with that version, or choose"
-    for again in (train_again, verify, lambda folder: pipeline.read_finished(folder)):
+    for again in (train_again, verify, pipeline.read_finished):
         with pytest.raises(ValueError, match=re.escape(error)):
             again(folder)
     assert main(["train", "quick", "--variant", "input_output", "--out", str(folder)]) == 2
     assert f"error: {error}" in capsys.readouterr().err.splitlines()[-1]
     assert snapshot(folder) == before
+
+
+def test_the_record_of_a_baseline_driver_is_no_run_to_continue_or_verify(tmp_path):
+    record = {"kind": "record", "variant": "random_driver", "made_with": {}, "budget": {}}
+    save_json(tmp_path / "record.json", record)
+    for again in (train_again, verify, pipeline.read_finished):
+        with pytest.raises(ValueError, match=r"record.json is of 'random_driver', no run: choose"):
+            again(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["record.json"]
 
 
 @pytest.mark.parametrize("name", ["vae", "mdn_rnn", "controller"])
@@ -665,7 +674,7 @@ def test_a_commit_is_only_that_of_the_checkout_in_which_the_library_is(tmp_path,
 
 def test_a_run_that_is_made_longer_has_the_new_configuration_in_its_record(quick_run):
     longer = QUICK.replace(evolution={"generations": 8})
-    assert pipeline.open_record(longer, quick_run, None)["config"] == longer.as_dict()
+    assert pipeline.open_record(longer, quick_run, None, "")["config"] == longer.as_dict()
 
 
 def run_stage(stage, folder, executor):

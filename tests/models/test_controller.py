@@ -62,7 +62,7 @@ def test_a_controller_for_each_car_gives_what_each_gives_alone():
 @pytest.mark.parametrize(
     ("features", "seen"), [("z, h", [1, 1, 1]), ("z", [1, 1, 0]), ("h", [0, 0, 1])]
 )
-def test_the_columns_of_z_and_of_h_are_told_apart(features, seen):
+def test_the_columns_of_z_and_of_h_are_separate(features, seen):
     assert seen_columns(features, 2, 1).tolist() == list(map(bool, seen))
 
 

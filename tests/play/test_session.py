@@ -120,11 +120,10 @@ def test_what_does_not_exist_is_refused(session):
 
 
 def test_dead_reckoning_follows_the_car(session):
-    hull = session.env.unwrapped.car.hull
-    start, angle = np.array(hull.position), hull.angle
+    racing = session.env.unwrapped
+    start, angle = racing.position, float(racing.cars.cars["angle"][0, 0])
     drive(session, ("gas", 60), ("left", 40))
-    hull = session.env.unwrapped.car.hull
-    moved = np.array(hull.position) - start
+    moved = racing.position - start
     turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     assert np.linalg.norm(
         driven_path(session.trajectory().motion)[-1] - turn @ moved

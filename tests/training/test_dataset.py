@@ -15,8 +15,8 @@ import pytest
 
 from stad_lab.cli import main
 from stad_lab.config import TRACK_RANGES, Config
-from stad_lab.envs.car_racing import make_env
-from stad_lab.envs.frames import difference_image, episode_differences, to_frame
+from stad_lab.envs.cars import Cars
+from stad_lab.envs.frames import difference_image, episode_differences
 from stad_lab.io.files import checksum, load_json, locked, save_json
 from stad_lab.training.dataset import (
     MANIFEST,
@@ -140,12 +140,11 @@ def test_an_episode_can_be_driven_again_bit_for_bit(quick_run):
 def test_an_action_is_kept_with_the_frame_on_which_it_was_taken(crop_bar):
     config = QUICK.replace(data={"random_starts": 0.0, "crop_bar": crop_bar})
     frames, actions, track = drive_randomly(config, 1)
-    env = make_env()
-    observation, _ = env.reset(seed=track)
+    cars = Cars(1, "frame", bar=not crop_bar)
+    cars.reset([track])
     for frame, action in zip(frames, actions, strict=True):
-        assert np.array_equal(frame, to_frame(observation, crop_bar))
-        observation, *_ = env.step(action)
-    env.close()
+        assert np.array_equal(frame, cars.draw()[0])
+        cars.step(action[None])
 
 
 def test_frames_are_uint8_and_actions_float32(quick_run):
@@ -161,7 +160,8 @@ import numpy as np
 from pathlib import Path
 from stad_lab.training.dataset import Dataset
 
-peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1e6 if sys.platform == "darwin" else 1e3)
+unit = 1e6 if sys.platform == "darwin" else 1e3
+peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 before = peak()
 dataset = Dataset(Path(sys.argv[1]))
 for indices in np.array_split(np.arange(len(dataset)), 100):

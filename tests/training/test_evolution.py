@@ -132,7 +132,9 @@ def test_an_evolution_that_is_stopped_while_it_is_watched_continues_to_the_same_
         if seen == [1, 2]:
             raise KeyboardInterrupt
 
-    again = lambda: evolve(config(processes=1), folder, watch=watch)
+    def again():
+        return evolve(config(processes=1), folder, watch=watch)
+
     with pytest.raises(KeyboardInterrupt):
         again()
     assert again()
@@ -427,11 +429,11 @@ def test_numpy_s_global_random_state_is_left_alone_and_has_no_effect():
         simulate(strategy, settings(), 5)
         return strategy.mean
 
-    np.random.seed(1)
-    state = np.random.get_state()[1].tolist()
+    np.random.seed(1)  # noqa: NPY002
+    state = np.random.get_state()[1].tolist()  # noqa: NPY002
     first = mean_of_five()
-    assert np.random.get_state()[1].tolist() == state
-    np.random.seed(2)
+    assert np.random.get_state()[1].tolist() == state  # noqa: NPY002
+    np.random.seed(2)  # noqa: NPY002
     assert np.array_equal(mean_of_five(), first)
 
 

@@ -1,4 +1,4 @@
-"""A finish: the same V and M, a search from the C of before, and one budget for all of it."""
+"""Fine-tuning: the same V and M, CMA-ES from the earlier C, and one budget for both runs."""
 
 import itertools
 import shlex
@@ -8,241 +8,181 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from stad_lab.__main__ import main, read_changes
-from stad_lab.agent import PRETRAINED, load_agent, load_controller, read_world_model
-from stad_lab.config import Settings
+from stad_lab.agent import PRETRAINED, load_agent
+from stad_lab.cli import main
 from stad_lab.evaluation.verify import verify
 from stad_lab.io.files import load_json, save_json
-from stad_lab.replication import run as replication
-from stad_lab.replication.experiments import ROWS, Row
-from stad_lab.replication.tables import RECORDS, learning_curve, summarise_row
+from stad_lab.io.weights import load_controller, load_world_model, save_controller
+from stad_lab.training import pipeline
 from stad_lab.training.evolution import LOG, generation_tracks
-from stad_lab.training.fine_tuning import FINISH, begin_finish, finish, finish_settings
+from stad_lab.training.fine_tuning import FINE_TUNING, begin, fine_tune, fine_tuning_config
 from stad_lab.training.pipeline import ship, total_budget
 from stad_lab.training.subspace import load_start, search_space
 
-VARIANT = "input_output"
 BRIEF = {"generations": 2, "population": 4, "tracks": 2, "validate_every": 1}
+C = "controller.safetensors"
 
 
-def go(earlier, folder, **changes):
-    """A brief finish of the run in `earlier`; returns what `finish` does."""
+def brief_config(earlier, evolution=None, **changes):
+    """The configuration of a brief fine-tuning of the run in `earlier`."""
+    return fine_tuning_config(earlier, evolution=BRIEF | (evolution or {}), **changes)
+
+
+def tune(earlier, folder, evolution=None, **changes):
+    """A brief fine-tuning of the run in `earlier`; returns what `fine_tune` does."""
     with ThreadPoolExecutor(1) as executor:
-        return finish(
-            VARIANT, finish_settings(earlier, **BRIEF | changes), earlier, folder, executor
-        )
+        config = brief_config(earlier, evolution, **changes)
+        return fine_tune(config, earlier, folder, executor)
+
+
+def copy_run(run, folder):
+    return shutil.copytree(run, folder, ignore=shutil.ignore_patterns("dataset"))
 
 
 @pytest.fixture(scope="module")
-def finished(quick_run, tmp_path_factory):
-    """The folder of a finish of the quick run."""
-    folder = tmp_path_factory.mktemp("finish") / "run"
-    assert go(quick_run, folder)
+def tuned(quick_run, tmp_path_factory):
+    """The folder of a fine-tuning of the quick run."""
+    folder = tmp_path_factory.mktemp("fine_tuning") / "run"
+    assert tune(quick_run, folder)
     return folder
 
 
-def test_a_finish_begins_at_the_controller_of_before_on_the_same_world_model(finished, quick_run):
-    world_model = read_world_model(finished, VARIANT)
-    before, _ = load_controller(quick_run / "controller.safetensors", VARIANT)
-    assert world_model.identities == read_world_model(quick_run, VARIANT).identities
-    assert np.array_equal(load_start(finished / "start.safetensors", world_model), before)
-    space = search_space(finish_settings(quick_run, **BRIEF), world_model, finished)
+def test_it_begins_at_the_earlier_controller_on_the_same_world_model(tuned, quick_run):
+    world_model = load_world_model(tuned)
+    before, _ = load_controller(quick_run / C)
+    assert world_model.checksums == load_world_model(quick_run).checksums
+    assert np.array_equal(load_start(tuned / "start.safetensors", world_model), before)
+    space = search_space(brief_config(quick_run), world_model, tuned)
     assert np.array_equal(space.expand(space.first), before)
-    after, _ = load_controller(finished / "controller.safetensors", VARIANT)
+    after, _ = load_controller(tuned / C)
     assert 0 < np.abs(after - before).max() < 1  # small steps away from it
 
 
-def test_every_agent_of_a_finish_drives_four_new_tracks_and_four_hard_ones_of_before(
-    finished, quick_run
-):
-    generations = load_json(finished / LOG)["generations"]
-    assert all(
-        np.shape(entry["returns"]) == (4, 2) and len(set(entry["tracks"])) == 2
-        for entry in generations
-    )
-    settings, log = finish_settings(quick_run), []
+def test_every_agent_drives_four_new_tracks_and_four_hard_earlier_ones(tuned, quick_run):
+    for entry in load_json(tuned / LOG)["generations"]:
+        assert np.shape(entry["returns"]) == (4, 2) and len(set(entry["tracks"])) == 2
+    config, log = fine_tuning_config(quick_run), []
     for _ in range(6):
-        tracks = generation_tracks(settings, log)
+        tracks = generation_tracks(config, log)
         log.append({"tracks": tracks, "returns": [[900.0 - place for place in range(8)]]})
-    assert (
-        log[5]["tracks"][:4] == log[0]["tracks"][:3:-1]
-    )  # the hardest ones that do not rest any more
+    assert log[5]["tracks"][:4] == log[0]["tracks"][:3:-1]  # the hardest that have rested
     assert not set(log[5]["tracks"][4:]) & {track for entry in log[:5] for track in entry["tracks"]}
 
 
-def test_a_finish_adds_its_episodes_and_agents_to_those_of_before(finished, quick_run):
-    record, before = load_json(finished / "record.json"), load_json(quick_run / "record.json")
+def test_its_episodes_and_agents_are_added_to_those_of_the_earlier_run(tuned, quick_run):
+    record, before = load_json(tuned / "record.json"), load_json(quick_run / "record.json")
     assert record["earlier"] == before
-    mine, first, both = record["budget"], total_budget(before), total_budget(record)
-    assert both["agents"] == first["agents"] + 8 and mine["random"]["episodes"] == 0
+    own, first, both = record["budget"], total_budget(before), total_budget(record)
+    assert both["agents"] == first["agents"] + 8 and own["random"]["episodes"] == 0
     assert both["episodes"] == first["episodes"] + 2 * 4 * 2 + 2 * 2
-    assert (
-        both["frames"]
-        == first["frames"] + mine["evolution"]["frames"] + mine["validation"]["frames"]
-    )
+    driven = own["evolution"]["frames"] + own["validation"]["frames"]
+    assert both["frames"] == first["frames"] + driven
 
 
-def test_a_finish_in_a_folder_with_another_v_and_m_is_refused(quick_run, tmp_path):
-    for part in ("autoencoder", "mdn_rnn"):
-        shutil.copy(PRETRAINED / VARIANT / f"{part}.safetensors", tmp_path)
+def test_a_folder_with_another_v_and_m_is_refused(quick_run, tmp_path):
+    for part in ("vae", "mdn_rnn"):
+        shutil.copy(PRETRAINED / "input_output" / f"{part}.safetensors", tmp_path)
+    config, before = brief_config(quick_run), sorted(tmp_path.iterdir())
     with pytest.raises(
-        ValueError,
-        match=r"controller.safetensors was made with another autoencoder .* C of one run",
+        ValueError, match=r"was made with another vae .*: give V, M and C of one run"
     ):
-        begin_finish(VARIANT, quick_run, tmp_path)
+        begin(config, quick_run, tmp_path)
+    assert sorted(tmp_path.iterdir()) == before
 
 
-def test_a_finish_goes_on_where_it_stopped_and_ends_with_the_same_bits(
-    finished, quick_run, tmp_path
-):
-    assert go(quick_run, tmp_path / "run", generations=1)
-    assert go(quick_run, tmp_path / "run")
-    for name in ("controller.safetensors", "start.safetensors"):
-        assert (tmp_path / "run" / name).read_bytes() == (finished / name).read_bytes()
-    assert load_json(tmp_path / "run" / LOG) == load_json(finished / LOG)
-    assert not go(quick_run, tmp_path / "run")
+def test_an_interrupted_fine_tuning_continues_to_the_same_bits(tuned, quick_run, tmp_path):
+    assert tune(quick_run, tmp_path / "run", {"generations": 1})
+    assert tune(quick_run, tmp_path / "run")
+    for name in (C, "start.safetensors"):
+        assert (tmp_path / "run" / name).read_bytes() == (tuned / name).read_bytes()
+    assert load_json(tmp_path / "run" / LOG) == load_json(tuned / LOG)
+    assert not tune(quick_run, tmp_path / "run")
 
 
-def test_a_finish_is_verified_and_shipped_like_a_second_round(finished, tmp_path):
-    shipped = ship(VARIANT, finished, tmp_path)
-    assert np.array_equal(
-        load_agent(VARIANT, shipped).parameters, load_agent(VARIANT, finished).parameters
-    )
-    for folder in (finished, shipped):
-        found = verify(folder)
-        assert found["log of CMA-ES"] == "ok: 2 generations lead to the same mean" and found[
-            "C"
-        ].startswith("ok")
-        assert not any(outcome.startswith("FAILED") for outcome in found.values())
-
-
-def test_a_copy_that_was_cut_off_is_made_again(finished, quick_run, tmp_path, monkeypatch):
+def test_an_interrupted_copy_of_v_is_made_again(tuned, quick_run, tmp_path, monkeypatch):
     calls = itertools.count()
 
     def interrupt(_):
-        if next(calls) == 2:  # after the record's file and folder: in the middle of V
+        if next(calls) == 0:  # in the middle of V
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr("os.fsync", interrupt)
-        go(quick_run, tmp_path / "run")
-    assert (tmp_path / "run" / "record.json").exists()
-    assert not (tmp_path / "run" / "autoencoder.safetensors").exists()
-    assert go(quick_run, tmp_path / "run")
-    assert (tmp_path / "run" / LOG).read_bytes() == (finished / LOG).read_bytes()
+        tune(quick_run, tmp_path / "run")
+    assert not (tmp_path / "run" / "vae.safetensors").exists()
+    assert tune(quick_run, tmp_path / "run")
+    assert (tmp_path / "run" / LOG).read_bytes() == (tuned / LOG).read_bytes()
+
+
+def test_a_fine_tuned_run_can_be_verified_shipped_and_verified_again(tuned, tmp_path, monkeypatch):
+    monkeypatch.setattr(pipeline, "PRETRAINED", tmp_path)
+    shipped = ship(tuned, "tuned")
+    assert shipped == tmp_path / "tuned"
+    assert np.array_equal(load_agent(shipped).parameters, load_agent(tuned).parameters)
+    for folder in (tuned, shipped):
+        found = verify(folder)
+        assert found["log of CMA-ES"] == "ok: 2 generations give the same mean"
+        assert found["C"].startswith("ok")
+        assert not any(outcome.startswith("FAILED") for outcome in found.values())
 
 
 @pytest.mark.parametrize(
     ("changes", "error"),
     [
-        (
-            {"width": 16},
-            r"width=16, but the run in .* has 8: leave it so, a finish may change generations, population",
-        ),
-        ({"patience": 0}, r"patience=0, but the run in .* has 100: leave it so"),
+        ({"vae": {"width": 16}}, r"made with vae.width=8, now vae.width=16 is asked for"),
+        ({"evolution": {"patience": 0}}, r"made with evolution.patience=100, now evolution.pat"),
         ({"depth": 3}, r"unknown setting 'depth'"),
     ],
 )
-def test_other_settings_than_those_of_a_search_are_refused_before_anything_is_written(
+def test_a_setting_that_fine_tuning_may_not_change_is_refused_before_anything_is_written(
     changes, error, quick_run, tmp_path
 ):
     with pytest.raises(ValueError, match=error):
-        go(quick_run, tmp_path / "run", **changes)
+        tune(quick_run, tmp_path / "run", **changes)
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    "missing", ["record.json", "autoencoder.safetensors", "controller.safetensors", LOG]
-)
+@pytest.mark.parametrize("missing", ["record.json", "vae.safetensors", C, LOG])
 def test_a_run_that_lacks_a_file_is_refused_before_anything_is_written(
     missing, quick_run, tmp_path
 ):
-    folder = shutil.copytree(
-        quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("rollouts")
-    )
+    folder = copy_run(quick_run, tmp_path / "half")
     (folder / missing).unlink()
-    with pytest.raises(FileNotFoundError, match=missing):
-        go(folder, tmp_path / "run")
+    lacks = "half.* is no trained agent" if missing == C else missing
+    with pytest.raises(FileNotFoundError, match=lacks):
+        tune(folder, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_a_driver_that_has_no_controller_is_refused():
-    with pytest.raises(ValueError, match="is of gentle_driver, which has no C to go on from"):
-        finish_settings(RECORDS / "gentle_driver" / "seed0")
-
-
-def test_a_run_that_is_not_at_its_end_is_refused_before_anything_is_written(quick_run, tmp_path):
-    folder = shutil.copytree(
-        quick_run, tmp_path / "half", ignore=shutil.ignore_patterns("rollouts")
-    )
+def test_an_unfinished_run_is_refused_before_anything_is_written(quick_run, tmp_path):
+    folder = copy_run(quick_run, tmp_path / "half")
     log = load_json(folder / LOG)
     save_json(folder / LOG, log | {"generations": log["generations"][:2]})
-    with pytest.raises(
-        ValueError,
-        match=r"is not at its end, with 2 of 4 generations: run its own command to the end",
-    ):
-        go(folder, tmp_path / "run")
+    error = r"is not finished, with 2 of 4 generations: run its own command to the end"
+    with pytest.raises(ValueError, match=error):
+        tune(folder, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_a_finish_of_another_run_is_not_taken_for_this_one(finished, quick_run, tmp_path):
-    other = shutil.copytree(
-        quick_run, tmp_path / "other", ignore=shutil.ignore_patterns("rollouts")
-    )
-    record = load_json(other / "record.json")
-    save_json(other / "record.json", record | {"seconds": {}})  # the same one, looked at again
-    assert not go(other, finished)
-    save_json(
-        other / "record.json",
-        record | {"budget": record["budget"] | {"random": {"episodes": 9, "frames": 9}}},
-    )
-    with pytest.raises(
-        ValueError,
-        match=r"holds a run that does not go on from the one given as it is now: choose another",
-    ):
-        go(other, finished)
+def test_a_fine_tuning_of_another_controller_is_not_taken_for_this_one(tuned, quick_run, tmp_path):
+    other = copy_run(quick_run, tmp_path / "other")
+    assert not tune(other, tuned)  # the same run in another place
+    parameters, metadata = load_controller(other / C)
+    del metadata["kind"]
+    save_controller(other / C, parameters + 1, **metadata)
+    with pytest.raises(ValueError, match=r"continues from another C than that of .*other"):
+        tune(other, tuned)
 
 
-def test_the_command_finishes_a_run_and_its_record_says_how(finished, quick_run, tmp_path, capsys):
-    made_with = load_json(finished / "record.json")["made_with"]
-    said = shlex.split(made_with["command"])
-    places = {"--path": quick_run, "--out": tmp_path / "run"}
-    arguments = [
-        str(places.get(before, word)) for before, word in zip(["", *said], said, strict=False)
-    ]
-    assert arguments[:4] == ["python", "-m", "stad_lab", "finish"]
-    changes = read_changes(
-        [word for before, word in zip(["", *said], said, strict=False) if before == "--set"]
-    )
-    assert changes == {name: BRIEF[name] for name in BRIEF if BRIEF[name] != FINISH[name]}
-    for outcome in ("controller: done", "the finish is there"):
+def test_the_command_in_the_record_makes_the_same_fine_tuning(
+    tuned, quick_run, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setitem(FINE_TUNING, "evolution", FINE_TUNING["evolution"] | BRIEF)
+    command = shlex.split(load_json(tuned / "record.json")["made_with"]["command"])
+    assert command[:4] == ["python", "-m", "stad_lab", "fine-tune"]
+    places = {"--run": str(quick_run), "--out": str(tmp_path / "run")}
+    arguments = [places.get(*pair) for pair in zip(["", *command], command, strict=False)]
+    for outcome in ("controller: done", "the fine-tuned run is there"):
         assert main(arguments[3:]) == 0
         assert outcome in capsys.readouterr().out
-    assert (tmp_path / "run" / LOG).read_bytes() == (finished / LOG).read_bytes()
-
-
-def test_a_row_of_finishes_goes_on_from_the_seeds_of_its_base(
-    evaluate_briefly, monkeypatch, tmp_path
-):
-    settings = Settings.preset("quick", processes=1, generations=2, v_steps=8, m_steps=4)
-    last = Settings.from_dict(settings.as_dict() | FINISH | BRIEF | {"validate_every": 2})
-    monkeypatch.setitem(ROWS, "first", Row("input", "before", settings, seeds=(0, 1)))
-    monkeypatch.setitem(ROWS, "last", Row("input", "after", last, seeds=(0, 1), base="first"))
-    evaluate_briefly(monkeypatch)
-    with ThreadPoolExecutor(1) as executor:
-        found = replication.replicate("last", tmp_path, executor, seeds=[1])
-        assert (
-            not (tmp_path / "first" / "seed0").exists() and (tmp_path / "first" / "seed1").exists()
-        )
-        before = (tmp_path / "first" / "seed1" / LOG).stat().st_mtime_ns
-        assert replication.replicate("last", tmp_path, executor, seeds=[1]) == found
-    assert (tmp_path / "first" / "seed1" / LOG).stat().st_mtime_ns == before
-    log = load_json(tmp_path / "last" / "seed1" / LOG)
-    assert log["settings"]["evolution_seed"] == 1 and log["settings"]["tracks"] == 2
-    base = summarise_row([tmp_path / "first" / "seed1"])
-    assert (
-        found["agents"] == base["agents"] + 2 * 4
-        and found["episodes"] == base["episodes"] + 2 * 4 * 2 + 2
-    )
-    episodes, scores = learning_curve(tmp_path / "last" / "seed1")
-    assert episodes.tolist() == [found["episodes"]] and len(scores) == 1
+    assert (tmp_path / "run" / LOG).read_bytes() == (tuned / LOG).read_bytes()

@@ -1,6 +1,5 @@
-"""Where C is searched: along every weight that it may have, or along the principal components of what it sees."""
+"""Where CMA-ES searches for C: along its weights, or along the components of what it sees."""
 
-import dataclasses
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 
@@ -8,173 +7,173 @@ import numpy as np
 import pytest
 import torch
 
-from stad_lab.agent import WorldModel, load_controller, read_world_model
-from stad_lab.config import Settings
+from stad_lab.agent import features_of
+from stad_lab.config import Config
 from stad_lab.evaluation.verify import verify
 from stad_lab.io.files import load_json, save_tensors
+from stad_lab.io.weights import WorldModel, load_controller, load_world_model
 from stad_lab.models.controller import control, seen_columns
 from stad_lab.models.mdn_rnn import MDNRNN
-from stad_lab.models.vae import AutoEncoder
-from stad_lab.training.dataset import Rollouts, collect_rollouts
-from stad_lab.training.evolution import averaged_mean, evolve, replay
+from stad_lab.models.vae import VAE
+from stad_lab.training import pipeline
+from stad_lab.training.dataset import Dataset, collect
+from stad_lab.training.evolution import LOG, averaged_mean, evolve, replay
 from stad_lab.training.pipeline import ship, train
 from stad_lab.training.subspace import (
-    COMPONENTS,
-    START,
-    features,
+    COMPONENTS_FILE,
+    START_FILE,
     find_components,
     principal_components,
     save_start,
     search_space,
 )
 
-VARIANT = "input_output"
-SETTINGS = Settings.preset("quick", components=5, sigma_decay=0.9, processes=1)
+QUICK = Config.preset("quick")
+CONFIG = QUICK.replace(evolution={"components": 5, "sigma_decay": 0.9}, processes=1)
+
+
+@pytest.fixture(scope="module")
+def dataset(quick_run):
+    """A function that opens the dataset of the quick run, as the stages are given it."""
+    opened = Dataset(quick_run / "dataset")
+    return lambda: opened
 
 
 @pytest.fixture(scope="module")
 def searched(quick_run, tmp_path_factory):
     """A quick run whose C was searched along five components."""
     folder = tmp_path_factory.mktemp("components") / "run"
-    for name in ("autoencoder", "mdn_rnn"):
-        folder.mkdir(exist_ok=True)
+    folder.mkdir()
+    for name in ("vae", "mdn_rnn"):
         shutil.copy(quick_run / f"{name}.safetensors", folder)
     with ThreadPoolExecutor(1) as executor:
-        assert train(VARIANT, SETTINGS, folder, quick_run / "rollouts", executor=executor)
+        assert train(CONFIG, folder, quick_run / "dataset", executor=executor)
     return folder
 
 
-def random_drives(columns, lengths=(40, 60), scales=None):
-    """What C might see in some episodes: correlated numbers, around a middle that is not zero."""
+def random_features(columns, scales=1.0):
+    """What C might see in two episodes: correlated numbers whose mean is not zero."""
     rng = np.random.default_rng(0)
-    mixed = (
-        rng.standard_normal((columns, columns))
-        * (np.ones(columns) if scales is None else scales)[:, None]
-    )
-    return [
-        (rng.standard_normal((length, columns)) @ mixed + 3).astype(np.float32)
-        for length in lengths
-    ]
+    mixed = rng.standard_normal((columns, columns)) * (np.ones(columns) * scales)[:, None]
+    whole = [rng.standard_normal((length, columns)) @ mixed + 3 for length in (40, 60)]
+    return [one.astype(np.float32) for one in whole]
 
 
-def test_the_components_are_those_of_largest_variance_over_all_episodes():
-    drives = random_drives(8, scales=np.array([5, 4, 3, 2, 1, 0.1, 0.1, 0.1]))
-    middle, components = principal_components(drives, np.ones(8, bool), 4)
-    seen = np.concatenate(drives).astype(float)
+def test_the_components_are_the_directions_of_largest_variance_over_all_episodes():
+    episodes = random_features(8, np.array([5, 4, 3, 2, 1, 0.1, 0.1, 0.1]))
+    middle, components = principal_components(episodes, np.ones(8, bool), 4)
+    seen = np.concatenate(episodes).astype(float)
     assert middle == pytest.approx(seen.mean(axis=0))
     _, _, expected = np.linalg.svd(seen - seen.mean(axis=0))
-    assert np.abs(components @ expected[:4].T) == pytest.approx(
-        np.eye(4), abs=1e-6
-    )  # the sign is free
+    signs = np.abs(components @ expected[:4].T)  # the sign of a component is free
+    assert signs == pytest.approx(np.eye(4), abs=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("sees", "columns"), [("z", slice(3)), ("h", slice(3, 8)), ("z, h", slice(0, 8))]
+    ("sees", "columns", "hidden"),
+    [
+        ("z", slice(3), slice(32, 56)),
+        ("h", slice(3, 8), slice(32)),
+        ("z, h", slice(0, 8), slice(0)),
+    ],
 )
-def test_what_c_may_not_see_has_no_weight(quick_run, sees, columns):
-    drives, seen = random_drives(8), seen_columns(sees, 3, 5)
-    _, components = principal_components(drives, seen, 100)
+def test_what_c_may_not_see_has_no_weight(quick_run, sees, columns, hidden):
+    seen = seen_columns(sees, 3, 5)
+    _, components = principal_components(random_features(8), seen, 100)
     assert components.shape == (seen.sum(), 8) and np.linalg.matrix_rank(components) == seen.sum()
     assert (np.delete(components, columns, axis=1) == 0).all()
-    space = search_space(
-        Settings.preset("quick", features=sees), read_world_model(quick_run, VARIANT), quick_run
-    )
+    config = QUICK.replace(evolution={"features": sees})
+    space = search_space(config, load_world_model(quick_run), quick_run)
     whole = space.expand(np.ones(len(space.first)))
     weights = whole[:-3].reshape(3, 56)
-    hidden = {"z": slice(32, 56), "h": slice(32), "z, h": slice(0)}[sees]
-    assert (
-        (weights[:, hidden] == 0).all()
-        and (np.delete(weights, hidden, axis=1) == 1).all()
-        and (whole[-3:] == 1).all()
-    )
+    assert (weights[:, hidden] == 0).all() and (whole[-3:] == 1).all()
+    assert (np.delete(weights, hidden, axis=1) == 1).all()
 
 
-def test_a_c_of_the_components_does_what_its_weights_say(searched, quick_run):
-    world_model = read_world_model(searched, VARIANT)
-    space = search_space(SETTINGS, world_model, searched)
-    rollouts = Rollouts(quick_run / "rollouts")
-    drives = zip(rollouts.frames, rollouts.actions, strict=True)
-    seen = np.concatenate([features(world_model, *drive) for drive in drives])
+def test_a_c_of_the_components_acts_as_its_weights_along_them_say(searched, dataset):
+    world_model = load_world_model(searched)
+    space = search_space(CONFIG, world_model, searched)
+    episodes = zip(dataset().frames, dataset().actions, strict=True)
+    seen = np.concatenate([features_of(world_model, *episode) for episode in episodes])
     middle, components = principal_components([seen], np.ones(56, bool), 5)
     found = np.random.default_rng(0).standard_normal(3 * 5 + 3)
-    raw = (
-        (seen - middle) @ components.T @ found[:15].reshape(3, 5).T
-        + found[15:]
-        + [0, SETTINGS.initial_gas, 0]
-    )
+    along = (seen - middle) @ components.T @ found[:15].reshape(3, 5).T
+    raw = along + found[15:] + [0, CONFIG.evolution.initial_gas, 0]
     steering = control(space.expand(found), seen)[:, 0]
     assert steering.std() > 0.02 and steering == pytest.approx(np.tanh(raw[:, 0]), abs=1e-3)
 
 
-def test_the_search_begins_with_the_first_controller_and_keeps_an_ordinary_one(searched):
-    log = load_json(searched / "evolution.json")
-    space = search_space(SETTINGS, read_world_model(searched, VARIANT), searched)
+def test_the_run_begins_with_the_first_controller_and_keeps_an_ordinary_one(searched):
+    log, gas = load_json(searched / LOG), CONFIG.evolution.initial_gas
+    space = search_space(CONFIG, load_world_model(searched), searched)
     start = space.expand(space.first)
-    assert (start[:-3] == 0).all() and start[-3:].tolist() == [0, SETTINGS.initial_gas, 0]
-    _, means = replay(space.first, SETTINGS, log["generations"][: log["best"]["generation"]])
-    parameters, _ = load_controller(searched / "controller.safetensors", VARIANT)
-    assert np.array_equal(parameters, space.expand(averaged_mean(means, SETTINGS)))
-    assert [len(mean) for mean in means] == [18] * len(means) and np.ptp(parameters) > 0
+    assert (start[:-3] == 0).all() and start[-3:].tolist() == [0, gas, 0]
+    until_best = log["generations"][: log["best"]["generation"]]
+    _, means = replay(space.first, CONFIG.evolution, log | {"generations": until_best})
+    parameters, _ = load_controller(searched / "controller.safetensors")
+    expected = space.expand(averaged_mean(means, CONFIG.evolution))
+    assert np.array_equal(parameters, expected) and np.ptp(parameters) > 0
+    assert {len(mean) for mean in means} == {18}
 
 
-def test_components_are_found_once_and_belong_to_their_v_and_m(searched, quick_run, tmp_path):
-    assert not find_components(VARIANT, SETTINGS, quick_run / "rollouts", searched)
-    assert not find_components(VARIANT, Settings.preset("quick"), quick_run / "rollouts", quick_run)
-    assert not (quick_run / "components.safetensors").exists()
+def test_components_are_fitted_once_and_belong_to_their_v_and_m(
+    searched, quick_run, dataset, tmp_path
+):
+    assert not find_components(CONFIG, dataset, searched)
+    assert not find_components(QUICK, dataset, quick_run)
+    assert not (quick_run / COMPONENTS_FILE).exists()
     other = shutil.copytree(searched, tmp_path / "other")
-    (other / "components.safetensors").unlink()
+    (other / COMPONENTS_FILE).unlink()
     with pytest.raises(FileNotFoundError, match=r"components\.safetensors"):
-        search_space(SETTINGS, read_world_model(other, VARIANT), other)
-    assert find_components(VARIANT, SETTINGS, quick_run / "rollouts", other)
-    assert (other / "components.safetensors").read_bytes() == (
-        searched / "components.safetensors"
-    ).read_bytes()
+        search_space(CONFIG, load_world_model(other), other)
+    assert find_components(CONFIG, dataset, other)
+    assert (other / COMPONENTS_FILE).read_bytes() == (searched / COMPONENTS_FILE).read_bytes()
 
 
-def test_a_file_under_the_name_of_another_part_is_refused(searched, tmp_path):
-    folder, world_model = (
-        shutil.copytree(searched, tmp_path / "run"),
-        read_world_model(searched, VARIANT),
-    )
-    shutil.copy(folder / "components.safetensors", folder / "start.safetensors")
-    with pytest.raises(ValueError, match="holds 'components': expected 'start'"):
-        search_space(SETTINGS, world_model, folder)
-    (folder / "start.safetensors").unlink()
-    shutil.copy(folder / "mdn_rnn.safetensors", folder / "components.safetensors")
-    with pytest.raises(ValueError, match="holds 'mdn_rnn': expected 'components'"):
-        search_space(SETTINGS, world_model, folder)
+def test_a_file_with_the_name_of_another_kind_is_refused(searched, tmp_path):
+    folder, world_model = shutil.copytree(searched, tmp_path / "run"), load_world_model(searched)
+    shutil.copy(folder / COMPONENTS_FILE, folder / START_FILE)
+    with pytest.raises(ValueError, match="holds 'components': expected a file of 'start'"):
+        search_space(CONFIG, world_model, folder)
+    (folder / START_FILE).unlink()
+    shutil.copy(folder / "mdn_rnn.safetensors", folder / COMPONENTS_FILE)
+    with pytest.raises(ValueError, match="holds 'mdn_rnn': expected a file of 'components'"):
+        search_space(CONFIG, world_model, folder)
 
 
-def test_a_search_does_not_go_on_along_other_components(searched, quick_run, tmp_path):
+def test_a_run_does_not_continue_along_other_components(searched, tmp_path):
     folder, other = (shutil.copytree(searched, tmp_path / name) for name in ("run", "other"))
-    (other / "components.safetensors").unlink()
-    fewer = Settings.preset(
-        "quick", episodes=4
-    )  # the components of other rollouts, for the same V and M
-    collect_rollouts(fewer, tmp_path / "rollouts")
-    assert find_components(VARIANT, SETTINGS, tmp_path / "rollouts", other)
-    shutil.copy(other / "components.safetensors", folder)
-    before = (folder / "evolution.json").read_bytes()
-    with pytest.raises(ValueError, match="holds other components, or another start"):
-        evolve(VARIANT, dataclasses.replace(SETTINGS, generations=6), folder)
-    assert (folder / "evolution.json").read_bytes() == before
+    (other / COMPONENTS_FILE).unlink()
+    # The components of another dataset, for the same V and M.
+    with ThreadPoolExecutor(1) as executor:
+        collect(QUICK.replace(data={"episodes": 4}), tmp_path / "dataset", executor)
+    assert find_components(CONFIG, lambda: Dataset(tmp_path / "dataset"), other)
+    shutil.copy(other / COMPONENTS_FILE, folder)
+    before = (folder / LOG).read_bytes()
+    with pytest.raises(ValueError, match="holds other components, or another first C"):
+        evolve(CONFIG.replace(evolution={"generations": 6}), folder)
+    assert (folder / LOG).read_bytes() == before
     assert verify(folder)["log of CMA-ES"].startswith("FAILED")
 
 
-def test_a_run_along_components_is_verified_shipped_and_verified_again(searched, tmp_path):
-    for folder in (searched, ship(VARIANT, searched, tmp_path)):
+def test_a_run_along_components_can_be_verified_shipped_and_verified_again(
+    searched, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(pipeline, "PRETRAINED", tmp_path)
+    for folder in (searched, ship(searched, "searched")):
         found = verify(folder)
-        assert found["log of CMA-ES"] == "ok: 4 generations lead to the same mean", found
+        assert found["log of CMA-ES"] == "ok: 4 generations give the same mean", found
         assert not any(outcome.startswith("FAILED") for outcome in found.values()), found
 
 
-def test_a_search_along_components_begins_at_the_start_too(tmp_path):
-    identities = {"autoencoder": "v", "mdn_rnn": "m"}
-    world_model = WorldModel(AutoEncoder("input", 4, 4), MDNRNN(4, 8, 3), 4, True, identities)
+def test_a_run_along_components_begins_at_the_start_too(tmp_path):
+    checksums = {"vae": "v", "mdn_rnn": "m"}
+    world_model = WorldModel(VAE("input", 4, 4), MDNRNN(4, 8, 3), 4, True, checksums)
     start = np.arange(39.0)
-    save_start(tmp_path / START, start, "input", world_model)
+    save_start(tmp_path / START_FILE, start, "input", world_model)
     parts = {"middle": torch.ones(12).double(), "components": torch.eye(12).double()[:5]}
-    save_tensors(tmp_path / COMPONENTS, parts, part="components", variant="input", **identities)
+    save_tensors(tmp_path / COMPONENTS_FILE, parts, kind="components", **checksums)
     for components in (5, 0):
-        space = search_space(Settings.preset("quick", components=components), world_model, tmp_path)
+        config = QUICK.replace(evolution={"components": components})
+        space = search_space(config, world_model, tmp_path)
         assert np.array_equal(space.expand(space.first), start)

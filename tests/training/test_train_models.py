@@ -154,16 +154,6 @@ def test_v_and_m_of_another_configuration_are_refused(
         FILES[name](QUICK.replace(**{stage: {setting: value}}), data, folder)
 
 
-def test_a_setting_of_c_leaves_v_and_m_valid(data, quick_run, run_with_v, interrupt_after):
-    other = QUICK.replace(evolution={"sigma": 0.3, "population": 5}, mdn_rnn={"steps": 21})
-    folder = run_with_v("run")
-    assert not train_vae(other, data, folder)
-    interrupt_after(5)
-    with pytest.raises(KeyboardInterrupt):
-        train_mdn_rnn(other, data, folder)
-    assert train_mdn_rnn(other.replace(evolution={"sigma": 0.4}), data, folder)
-
-
 def test_a_checkpoint_that_a_killed_process_left_behind_is_cleared_away(
     data, quick_run, run_with_v
 ):
@@ -174,25 +164,6 @@ def test_a_checkpoint_that_a_killed_process_left_behind_is_cleared_away(
         left_over.write_bytes(b"state")
         assert not train(QUICK, data, folder)
         assert not left_over.exists()
-
-
-def test_training_leaves_torch_s_own_settings_alone_and_does_not_depend_on_them(
-    data, quick_run, tmp_path
-):
-    torch.manual_seed(1)
-    state, config = torch.get_rng_state(), QUICK.replace(vae={"steps": 2})
-    train_vae(config, data, tmp_path / "first")
-    assert torch.equal(torch.get_rng_state(), state)
-    torch.manual_seed(2)
-    torch.set_default_dtype(torch.float64)
-    try:
-        with torch.no_grad():
-            train_vae(config, data, tmp_path / "second")
-        assert torch.get_default_dtype() == torch.float64
-    finally:
-        torch.set_default_dtype(torch.float32)
-    files = [tmp_path / name / "vae.safetensors" for name in ("first", "second")]
-    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_no_steps_leave_m_with_its_initial_weights(data, run_with_v, monkeypatch):

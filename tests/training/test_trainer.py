@@ -48,10 +48,11 @@ def test_the_learning_rate_falls_to_a_tenth_along_a_cosine(tmp_path, monkeypatch
 
 def test_weights_that_are_not_finite_after_the_last_step_are_not_saved(tmp_path):
     model = torch.nn.Linear(1, 1)
-    losses = lambda x: {"total": torch.sqrt(0 * model(x)).sum()}
-    heldout = lambda: {"total": model(torch.ones(1)).item()}
+    training = small_training(tmp_path, model, steps=1)
+    training.losses = lambda x: {"total": torch.sqrt(0 * model(x)).sum()}
+    training.heldout_losses = lambda: {"total": model(torch.ones(1)).item()}
     with pytest.raises(FloatingPointError, match="fit: the loss is nan in step 0"):
-        fit(small_training(tmp_path, model, losses=losses, heldout_losses=heldout, steps=1))
+        fit(training)
     assert not (tmp_path / "state").exists()
 
 
@@ -161,7 +162,7 @@ def test_a_checkpoint_made_before_a_setting_existed_continues(dataset, tmp_path,
     trainer.save_tensors(tmp_path / CHECKPOINT, tensors, **metadata)
     older = shutil.copytree(tmp_path, tmp_path / "older")
     assert train_vae(QUICK, dataset, tmp_path)
-    with pytest.raises(ValueError, match="made with vae.difference_weight=1.0, now vae.differ"):
+    with pytest.raises(ValueError, match=r"made with vae.difference_weight=1.0, now vae.differ"):
         train_vae(QUICK.replace(vae={"difference_weight": 2.0}), dataset, older)
 
 
