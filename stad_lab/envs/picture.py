@@ -126,26 +126,24 @@ MINUS_ZERO = MAX_SCORE - MIN_SCORE + 1  # where the table has "-000"
 
 
 class Ground(NamedTuple):
-    """The painted grounds of several cars.
-
-    Attributes:
-        texels: uint8 (cars, SIZE, SIZE), kinds, shades and flags.
-        quarter, eighth, sixteenth: uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours
-            (red in the lowest byte).
-        colors: uint8 (cars, 8, 3), in the order of TEXELS.
-        palette: uint64 (cars, 256), the colour of each texel in 16-bit lanes.
-        cells: uint8 (cars, CELLS, CELLS), HAS_ROAD where a road polygon may have painted.
-        pattern: uint8 (PERIOD, PERIOD), texels of background and grass without a road.
-    """
+    """The painted grounds of several cars."""
 
     texels: np.ndarray
+    """uint8 (cars, SIZE, SIZE), kinds, shades and flags."""
     quarter: np.ndarray
+    """uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours (red in the lowest byte)."""
     eighth: np.ndarray
+    """uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours (red in the lowest byte)."""
     sixteenth: np.ndarray
+    """uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours (red in the lowest byte)."""
     colors: np.ndarray
+    """uint8 (cars, 8, 3), in the order of TEXELS."""
     palette: np.ndarray
+    """uint64 (cars, 256), the colour of each texel in 16-bit lanes."""
     cells: np.ndarray
+    """uint8 (cars, CELLS, CELLS), HAS_ROAD where a road polygon may have painted."""
     pattern: np.ndarray
+    """uint8 (PERIOD, PERIOD), texels of background and grass without a road."""
 
 
 def make_ground(cars: int) -> Ground:
@@ -1038,17 +1036,14 @@ def draw_cars(out, ground, pictures, which, cars, roads, tiles, bar):
 
 
 class Pictures(NamedTuple):
-    """Small pictures that many frames share; nobody writes to them.
-
-    Attributes:
-        car: uint8 (4, turns, phases, 6, 4, 4), quarters of the car as `draw_quarter` makes them.
-        score: uint8 (n, 12, 12), every score in white on black, in the size of the observation.
-        small_score: uint8 (n, 8, 8), in the size of the agent's frame.
-    """
+    """Small pictures that many frames share; nobody writes to them."""
 
     car: np.ndarray
+    """uint8 (4, turns, phases, 6, 4, 4), quarters of the car as `draw_quarter` makes them."""
     score: np.ndarray
+    """uint8 (n, 12, 12), every score in white on black, in the size of the observation."""
     small_score: np.ndarray
+    """uint8 (n, 8, 8), in the size of the agent's frame."""
 
 
 _making = threading.Lock()  # pygame's fonts are not made for threads

@@ -36,23 +36,20 @@ KERB_COLORS = np.array([[255, 255, 255], [255, 0, 0]], np.uint8)  # of even and 
 
 
 class Track(NamedTuple):
-    """One track of `n` tiles and `k` kerbs. Lengths are in world units, angles in radians.
-
-    Attributes:
-        path: float64 (n, 4): for each point of the centre line its angle seen from the origin, the
-            heading of the road, x and y. The car starts at point 0. (Gymnasium's `env.track`.)
-        tiles: float64 (n, 4, 2): corners of tile i, between the points i and i - 1 of the path.
-        kerbs: float64 (k, 4, 2): corners of the kerbs.
-        kerb_tiles: int64 (k,), increasing: the tile of each kerb. Gymnasium draws the kerb after
-        it.
-        kerb_colors: uint8 (k, 3): white beside even tiles, red beside odd ones.
-    """
+    """One track of `n` tiles and `k` kerbs. Lengths are in world units, angles in radians."""
 
     path: np.ndarray
+    """float64 (n, 4): for each point of the centre line its angle seen from the origin, the
+    heading of the road, x and y. The car starts at point 0. (Gymnasium's `env.track`.)
+    """
     tiles: np.ndarray
+    """float64 (n, 4, 2): corners of tile i, between the points i and i - 1 of the path."""
     kerbs: np.ndarray
+    """float64 (k, 4, 2): corners of the kerbs."""
     kerb_tiles: np.ndarray
+    """int64 (k,), increasing: the tile of each kerb. Gymnasium draws the kerb after it."""
     kerb_colors: np.ndarray
+    """uint8 (k, 3): white beside even tiles, red beside odd ones."""
 
 
 def make_track(random: np.random.Generator) -> Track:

@@ -1,8 +1,10 @@
 """CarRacing-v3 for many cars at once, as a native `gymnasium.vector.VectorEnv`.
 
-envs = gymnasium.make_vec(
-    "stad_lab:StadLab/CarRacing-v3", num_envs=16, vectorization_mode="vector_entry_point"
-)
+Make it by its name::
+
+    envs = gymnasium.make_vec(
+        "stad_lab:StadLab/CarRacing-v3", num_envs=16, vectorization_mode="vector_entry_point"
+    )
 """
 
 from collections.abc import Sequence

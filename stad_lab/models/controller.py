@@ -41,7 +41,7 @@ def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
         features: z and h side by side, (cars, latent_size + hidden_size).
 
     Returns:
-        float32 (cars, 3): steering in [-1, 1], gas and brake in [0, 1].
+        Steering in [-1, 1], gas and brake in [0, 1], float32 (cars, 3).
 
     Raises:
         ValueError: an action that is not finite; CarRacing itself would not refuse it.

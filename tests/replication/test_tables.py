@@ -68,3 +68,22 @@ def test_each_cma_es_run_has_its_controller_and_all_its_returns():
     names = {tables.key(*run) for run in runs[["experiment", "seed", "role"]].to_numpy()}
     assert names == {path.stem for path in (tables.DATA / "controllers").iterdir()}
     assert all(np.isfinite(tables.fitness(name)["returns"]).all() for name in names)
+
+
+def test_a_benchmark_takes_the_place_of_the_same_parts(tmp_path):
+    for name in ("speed", "provenance"):
+        shutil.copyfile(tables.DATA / f"{name}.csv", tmp_path / f"{name}.csv")
+    row = {"median": 2.0, "rounds": [1.0, 2.0, 3.0], "ratio": 1.0}
+    result = {"made_with": {"commit": "c0ffee", "python": "3.11"}, "rounds": 3}
+    result |= {"loop": {"frames a second": {"one": row}, "costs": {"V": 5.5, "equal": True}}}
+    save_json(tmp_path / "benchmark.json", result)
+    before = tables.read("speed", tmp_path)
+    for _ in range(2):
+        tables.add_speed(tmp_path / "benchmark.json", tmp_path)
+    after = tables.read("speed", tmp_path)
+    assert after[after.part == "loop"].value.tolist() == [5.5, 1, 1, 2, 3]
+    others = [table[table.part != "loop"].reset_index(drop=True) for table in (before, after)]
+    assert others[0].equals(others[1])
+    made_with = tables.read("provenance", tmp_path)
+    line = made_with[(made_with.table == "speed") & (made_with.source == "benchmark")]
+    assert line.commit.tolist() == ["c0ffee"]
