@@ -40,9 +40,8 @@ def locked(folder: Path) -> Iterator[None]:
         lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
         lock.acquire()
     except Timeout:
-        raise BlockingIOError(
-            f"{folder} is in use by another process: wait for it, or choose another folder"
-        ) from None
+        message = f"{folder} is in use by another process: wait for it, or choose another folder"
+        raise BlockingIOError(message) from None
     except OSError as error:
         message = f"{folder} is no folder to write to ({error.strerror}): choose another one"
         raise OSError(message) from error
@@ -236,9 +235,8 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     except Exception as error:  # the parser meets bytes of any kind, and raises many errors
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
     if not isinstance(metadata, dict):
-        raise ValueError(
-            f"{path} was not written by stad_lab: give a file of `python -m stad_lab train`"
-        )
+        remedy = "give a file of `python -m stad_lab train`"
+        raise ValueError(f"{path} was not written by stad_lab: {remedy}")
     wanted = metadata.pop(CHECKSUM, None)
     if checksum_of_tensors(tensors, json.dumps(metadata)) != wanted:
         raise damaged(path, "its content is not that of its checksum", remedy)

@@ -44,7 +44,8 @@ def save_vae(
     """Write V with its configuration, its training history and the checksum of its dataset."""
     metadata = {"variant": vae.variant, "seed": config.seed, "vae": dataclasses.asdict(config.vae)}
     metadata |= {"crop_bar": config.data.crop_bar, "dataset": dataset, "history": history or []}
-    save_tensors(path, vae.state_dict(), **described("vae", vae.state_dict()), **metadata)
+    weights = vae.state_dict()
+    save_tensors(path, weights, kind="vae", weights=checksum_of_tensors(weights), **metadata)
 
 
 @torch.random.fork_rng([])  # a new module draws weights, which are replaced
@@ -64,10 +65,9 @@ def save_mdn_rnn(
 ) -> None:
     """Write M with its configuration, its training history and the checksum of its V."""
     metadata = {"variant": config.variant, "seed": config.seed, "latent_size": mdn_rnn.latent_size}
-    metadata |= {"mdn_rnn": dataclasses.asdict(config.mdn_rnn), "vae": vae}
-    metadata |= {"history": history or []}
-    weights = mdn_rnn.state_dict()
-    save_tensors(path, weights, **described("mdn_rnn", weights), **metadata)
+    settings, weights = dataclasses.asdict(config.mdn_rnn), mdn_rnn.state_dict()
+    metadata |= {"mdn_rnn": settings, "vae": vae, "history": history or []}
+    save_tensors(path, weights, kind="mdn_rnn", weights=checksum_of_tensors(weights), **metadata)
 
 
 @torch.random.fork_rng([])
@@ -108,19 +108,12 @@ def load_kind(path: Path, kind: str, *required: str) -> tuple[dict[str, torch.Te
     return tensors, metadata
 
 
-def described(kind: str, weights: dict[str, torch.Tensor]) -> dict:
-    """The kind and the checksum of some weights, for their metadata."""
-    return {"kind": kind, "weights": checksum_of_tensors(weights)}
-
-
 def check_belongs(path: Path, metadata: dict, **checksums: str) -> None:
     """Raise ValueError unless a file names the V (and M) of these checksums as its own."""
     for part, checksum in checksums.items():
         if metadata.get(part) != checksum:
-            remedy = "give V, M and C of one run"
-            raise ValueError(
-                f"{path} was made with another {part} than the one beside it: {remedy}"
-            )
+            message = f"{path} was made with another {part} than the one beside it"
+            raise ValueError(f"{message}: give V, M and C of one run")
 
 
 def load_world_model(folder: Path) -> WorldModel:

@@ -208,13 +208,10 @@ def check_disk(folder: Path, needed: int) -> None:
 
 
 class EpisodeFrames(Sequence):
-    """The frames of every episode, uint8 (T, 64, 64, 3), read from the disk at every access.
-
-    Memory-mapped files would count as the process's memory once they are touched.
-    """
+    """The frames of every episode, uint8 (T, 64, 64, 3), read from the disk at every access."""
 
     def __init__(self, paths: list[Path]):
-        self.paths = paths
+        self.paths = paths  # not memory-mapped: that counts as our memory once it is touched
 
     def __len__(self) -> int:
         return len(self.paths)

@@ -20,15 +20,9 @@ from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent, drive
 from stad_lab.config import STREAMS, Config, EvolutionConfig, check_same, track_seeds
+from stad_lab.io import weights
 from stad_lab.io.files import load_json, locked, save_json
-from stad_lab.io.weights import (
-    CONTROLLER_FILE,
-    WorldModel,
-    check_belongs,
-    load_controller,
-    load_world_model,
-    save_controller,
-)
+from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_world_model
 from stad_lab.io.workers import run_in_order, single_thread, worker_threads
 from stad_lab.training.subspace import SearchSpace, search_space
 
@@ -136,7 +130,7 @@ def read_log(config: Config, folder: Path, world_model: WorldModel) -> dict:
     log = load_json(path, "move it and the controller away to evolve C again", kind="evolution")
     fixed = {name: value for name, value in settings.items() if name != "generations"}
     check_same(path, log, made_with | {"evolution": fixed})
-    check_belongs(path, log, **world_model.checksums)
+    weights.check_belongs(path, log, **world_model.checksums)
     done, asked = len(log["generations"]), config.evolution.generations
     if done > asked:
         raise ValueError(
@@ -223,8 +217,7 @@ def replay(
         if crc(strategy.mean) != entry["mean_checksum"]:
             raise ValueError(
                 f"replaying the log gives another mean in generation {number + 1}: the log was"
-                " changed, or made on another machine or by other versions of cma and numpy. Start"
-                " in a new folder"
+                " changed, or is of another machine or other versions. Start in a new folder"
             )
     return strategy, means
 
@@ -239,7 +232,7 @@ def kept_generation(folder: Path, log: dict) -> int | None:
     path = folder / CONTROLLER_FILE
     if not path.exists():
         return None
-    parameters, metadata = load_controller(path)
+    parameters, metadata = weights.load_controller(path)
     generation = metadata.get("generation")
     entries = [entry for entry in log["generations"] if entry["generation"] == generation]
     validations = [entry["validation"] for entry in entries if "validation" in entry]
@@ -264,7 +257,7 @@ def note_best(log: dict) -> bool:
 def keep_controller(run: Evolution, controller: np.ndarray) -> None:
     """Write C, float64 (parameters,), with its generation and the checksums of V and M."""
     metadata = {"variant": run.config.variant, **run.log["best"], **run.world_model.checksums}
-    save_controller(run.folder / CONTROLLER_FILE, controller, **metadata)
+    weights.save_controller(run.folder / CONTROLLER_FILE, controller, **metadata)
 
 
 def crc(vector: np.ndarray) -> int:
@@ -299,9 +292,7 @@ def drive_generation(
 ) -> dict:
     """Let every agent drive the next generation's tracks; returns its entry of the log.
 
-    Args:
-        source: what `hand_out` returned.
-        population: of controllers, float64 (agents, parameters).
+    `source` is from `hand_out`; `population` holds controllers, float64 (agents, parameters).
     """
     tracks = generation_tracks(config, earlier)
     agents = np.repeat(population, len(tracks), axis=0)

@@ -53,9 +53,7 @@ def fine_tune(
 
     `folder` becomes a run of its own, with copies of V and M and with the earlier run's record.
 
-    Args:
-        config: as `fine_tuning_config` makes it.
-        executor: who drives; None for `config.processes` threads of this machine.
+    `config` is made by `fine_tuning_config`; `executor` is as for `evolve`.
 
     Raises:
         ValueError: a setting outside OPEN is not the earlier run's, that run is damaged or not

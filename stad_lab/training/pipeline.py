@@ -21,6 +21,7 @@ import shlex
 import subprocess
 import threading
 import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
@@ -250,10 +251,8 @@ def read_finished(earlier: Path) -> dict:
     log = load_json(earlier / LOG, GIVE_A_RUN)
     done, asked = len(log["generations"]), log["evolution"]["generations"]
     if done != asked:
-        raise ValueError(
-            f"CMA-ES in {earlier} is not finished, with {done} of {asked} generations: run its own"
-            " command to the end first"
-        )
+        found = f"with {done} of {asked} generations: run its own command to the end first"
+        raise ValueError(f"CMA-ES in {earlier} is not finished, {found}")
     return record
 
 
@@ -331,29 +330,23 @@ def budget(config: Config, folder: Path, data: Path | None) -> dict:
 
     Those of an earlier run are in its own record; `total_budget` adds them.
     """
-    spent = {"random": {"episodes": 0, "frames": 0}}
+    spent = defaultdict(Counter, random=Counter(episodes=0, frames=0))
     count = config.data.episodes
     again = config.data.agent_episodes > 0
     order = second_iteration.order_of_episodes(config) if again else range(count)
     for entry in load_json(data / MANIFEST)["episodes"] if data else ():
         driver = "random" if order[entry["index"]] < count else "agent_driver"
-        add(spent, driver, 1, entry["frames"])
+        spent[driver].update(episodes=1, frames=entry["frames"])
     if (folder / LOG).exists():
         generations = load_json(folder / LOG)["generations"]
         spent["agents"] = sum(len(entry["returns"]) for entry in generations)
         for entry in generations:
-            add(spent, "evolution", sum(map(len, entry["returns"])), entry["frames"])
-            if "validation" in entry:
-                validation = entry["validation"]
-                add(spent, "validation", len(validation["returns"]), validation["frames"])
-    return spent
-
-
-def add(spent: dict, purpose: str, episodes: int, frames: int) -> None:
-    """Add episodes and frames to those of a purpose."""
-    one = spent.setdefault(purpose, {"episodes": 0, "frames": 0})
-    one["episodes"] += episodes
-    one["frames"] += frames
+            episodes = sum(map(len, entry["returns"]))
+            spent["evolution"].update(episodes=episodes, frames=entry["frames"])
+            if validation := entry.get("validation"):
+                episodes = len(validation["returns"])
+                spent["validation"].update(episodes=episodes, frames=validation["frames"])
+    return dict(spent)
 
 
 def total_budget(record: dict) -> dict[str, int]:
@@ -391,7 +384,7 @@ def ship(folder: str | Path, name: str) -> Path:
         for key, value in tensors.items():
             tensors[key] = value.half() if value.dtype == torch.float32 else value
         save_tensors(target / one, tensors, **metadata)
-    for one in (one for one in shipped if one not in read):
+    for one in sorted(set(shipped) - read.keys()):
         copy_file(folder / one, target)
     for file in target.glob("*.*"):
         if file.is_file() and file.name not in shipped and file.suffix != ".md":

@@ -94,9 +94,9 @@ def drive_either(
 
 
 class NoisyDriver:
-    """An agent whose steering and gas are disturbed, so that it meets many situations.
+    """An agent whose steering and gas are disturbed, in each episode by another strength of noise.
 
-    The strength of the noise differs from episode to episode. M is told what was done.
+    So it meets many situations. M receives the disturbed actions.
     """
 
     def __init__(self, agent: Agent, rng: np.random.Generator):
