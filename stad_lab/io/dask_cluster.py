@@ -29,8 +29,6 @@ class ClusterExecutor(ClientExecutor):
 
         It is the result of a task, so Dask computes it again if the workers that held it are lost.
         All workers fetch it now, because Dask prefers to send a task to where its arguments are.
-
-        TaskError if the scheduler or all workers are lost.
         """
         once = {"allow_other_workers": True, "pure": False}
         with warnings.catch_warnings(), task_errors("share"):

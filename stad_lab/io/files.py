@@ -33,22 +33,18 @@ def locked(folder: Path) -> Iterator[None]:
     """Own a folder for a `with` block; it is made if missing, and cleared of half-written files.
 
     The operating system frees the lock when the process ends. A process may lock it repeatedly.
-
-    Raises:
-        OSError: another process works in the folder, or it cannot be written to.
+    OSError if another process works in the folder, or it cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
         lock.acquire()
     except Timeout:
-        raise BlockingIOError(
-            f"{folder} is in use by another process: wait for it, or choose another folder"
-        ) from None
+        message = f"{folder} is in use by another process: wait for it, or choose another folder"
+        raise BlockingIOError(message) from None
     except OSError as error:
-        raise OSError(
-            f"{folder} is no folder to write to ({error.strerror}): choose another one"
-        ) from error
+        message = f"{folder} is no folder to write to ({error.strerror}): choose another one"
+        raise OSError(message) from error
     try:
         for file in folder.glob(".*.part"):
             ours = re.search(r"\.(\d+)\.[^.]*\.part$", file.name)
@@ -60,11 +56,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that a crash at any moment leaves the old version or the new one.
-
-    Raises:
-        OSError: it cannot be written; the old version is still there.
-    """
+    """Write a file so that a crash, or an OSError, leaves the old version or the new one."""
     temporary = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -76,7 +68,9 @@ def write_bytes(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        temporary.chmod(0o666 & ~current_umask())
+        umask = os.umask(0)
+        os.umask(umask)
+        temporary.chmod(0o666 & ~umask)
         replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
@@ -85,13 +79,6 @@ def write_bytes(path: Path, content: bytes) -> None:
         if temporary:
             with suppress(OSError):
                 temporary.unlink(missing_ok=True)
-
-
-def current_umask() -> int:
-    """The permissions that new files of this process do not get."""
-    umask = os.umask(0)
-    os.umask(umask)
-    return umask
 
 
 def replace(temporary: Path, path: Path) -> None:
@@ -143,22 +130,15 @@ def check_writable(path: Path) -> None:
 
 
 def read_bytes(path: Path, remedy: str) -> bytes:
-    """Read a file.
-
-    Raises:
-        FileNotFoundError: no such file; the message carries the remedy.
-        OSError: there is something, but it cannot be read.
-    """
+    """Read a file. The message of a FileNotFoundError, or of another OSError, has the remedy."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
         where = "" if path.parent.is_dir() else f" (there is no folder {path.parent})"
         raise FileNotFoundError(f"{path} does not exist{where}: {remedy}") from None
     except OSError as error:
-        raise OSError(
-            f"{path} cannot be read ({error.strerror}): make it readable, or move it away and"
-            f" {remedy}"
-        ) from error
+        remedy = f"make it readable, or move it away and {remedy}"
+        raise OSError(f"{path} cannot be read ({error.strerror}): {remedy}") from error
 
 
 def copy_file(source: Path, folder: Path) -> None:
@@ -172,10 +152,7 @@ def checksum(content: bytes) -> str:
 
 
 def save_json(path: Path, value: dict) -> None:
-    """Write a dict as JSON, atomically, with a checksum of the rest as its last entry.
-
-    Each entry has a line, and so has each element of a list of dicts.
-    """
+    """Write a dict as JSON, atomically, with a checksum of the rest as its last entry."""
     value = {name: part for name, part in value.items() if name != CHECKSUM}
     whole = value | {CHECKSUM: checksum_of_json(value)}
     lines = [f"{json.dumps(name)}: {layout(part)}" for name, part in whole.items()]
@@ -183,7 +160,7 @@ def save_json(path: Path, value: dict) -> None:
 
 
 def layout(part: Any) -> str:
-    """One entry of a file as JSON."""
+    """One entry of a file as JSON: a line, or a line for each element of a list of dicts."""
     if isinstance(part, list) and part and isinstance(part[0], dict):
         return "[\n" + ",\n".join(f" {json.dumps(element)}" for element in part) + "\n]"
     return json.dumps(part)
@@ -197,13 +174,9 @@ def checksum_of_json(value: Any) -> str:
 def load_json(path: Path, remedy: str = "make it again", kind: str | None = None) -> dict:
     """Read what `save_json` wrote.
 
-    Args:
-        kind: that the file's entry "kind" must have, if it has one.
-
     Raises:
-        FileNotFoundError: no such file; the message carries the remedy.
-        OSError: it cannot be read.
-        ValueError: the file is damaged, was changed by hand, or is of another kind.
+        OSError: as `read_bytes`.
+        ValueError: the file is damaged, was changed by hand, or names another kind as its own.
     """
     content = read_bytes(path, remedy)
     try:
@@ -251,8 +224,7 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     """Read what `save_tensors` wrote: (tensors, metadata).
 
     Raises:
-        FileNotFoundError: no such file; the message carries the remedy.
-        OSError: it cannot be read.
+        OSError: as `read_bytes`.
         ValueError: the file is damaged, or was not written by stad_lab.
     """
     content = read_bytes(path, remedy)
@@ -263,9 +235,8 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     except Exception as error:  # the parser meets bytes of any kind, and raises many errors
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
     if not isinstance(metadata, dict):
-        raise ValueError(
-            f"{path} was not written by stad_lab: give a file of `python -m stad_lab train`"
-        )
+        remedy = "give a file of `python -m stad_lab train`"
+        raise ValueError(f"{path} was not written by stad_lab: {remedy}")
     wanted = metadata.pop(CHECKSUM, None)
     if checksum_of_tensors(tensors, json.dumps(metadata)) != wanted:
         raise damaged(path, "its content is not that of its checksum", remedy)
@@ -273,20 +244,13 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
 
 
 def load_into(module: torch.nn.Module, tensors: dict[str, torch.Tensor], path: Path) -> None:
-    """Put tensors into a module as float32, if every name and shape fits and all is finite.
-
-    Raises:
-        ValueError: names or shapes that differ, or weights that are not finite.
-    """
+    """Put tensors into a module as float32; ValueError if a name, shape or value is wrong."""
     expected = module.state_dict()
     for name in sorted(expected.keys() | tensors.keys()):
-        if (
-            name not in tensors
-            or name not in expected
-            or tensors[name].shape != expected[name].shape
-        ):
-            found = tuple(tensors[name].shape) if name in tensors else "nothing"
-            wanted = tuple(expected[name].shape) if name in expected else "nothing"
+        found, wanted = (
+            tuple(part[name].shape) if name in part else "nothing" for part in (tensors, expected)
+        )
+        if found != wanted:
             raise ValueError(
                 f"{path} holds {found} for {name!r}, {type(module).__name__} of these settings has"
                 f" {wanted}: the weights belong to another variant or size"

@@ -28,12 +28,9 @@ class WorldModel(NamedTuple):
 
     vae: VAE
     mdn_rnn: MDNRNN
-    stride: int
-    """k of the difference image, frames."""
-    crop_bar: bool
-    """Whether V sees frames without the indicator bar."""
-    checksums: dict[str, str]
-    """Of V ("vae") and M ("mdn_rnn"), by which C names them."""
+    stride: int  # k of the difference image, frames
+    crop_bar: bool  # whether V sees frames without the indicator bar
+    checksums: dict[str, str]  # of V ("vae") and M ("mdn_rnn"), by which C names them
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -47,16 +44,15 @@ def save_vae(
     """Write V with its configuration, its training history and the checksum of its dataset."""
     metadata = {"variant": vae.variant, "seed": config.seed, "vae": dataclasses.asdict(config.vae)}
     metadata |= {"crop_bar": config.data.crop_bar, "dataset": dataset, "history": history or []}
-    save_tensors(path, vae.state_dict(), **described("vae", vae.state_dict()), **metadata)
+    weights = vae.state_dict()
+    save_tensors(path, weights, kind="vae", weights=checksum_of_tensors(weights), **metadata)
 
 
 @torch.random.fork_rng([])  # a new module draws weights, which are replaced
 def load_vae(path: Path) -> tuple[VAE, dict]:
     """Read V: (the VAE in evaluation mode, its metadata).
 
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: damaged, or not V.
+    FileNotFoundError if there is no such file; ValueError if it is damaged, or not V.
     """
     tensors, metadata = load_kind(path, "vae", "variant", "vae", "crop_bar", "weights", "history")
     vae = VAE(metadata["variant"], metadata["vae"]["latent_size"], metadata["vae"]["width"])
@@ -69,10 +65,9 @@ def save_mdn_rnn(
 ) -> None:
     """Write M with its configuration, its training history and the checksum of its V."""
     metadata = {"variant": config.variant, "seed": config.seed, "latent_size": mdn_rnn.latent_size}
-    metadata |= {"mdn_rnn": dataclasses.asdict(config.mdn_rnn), "vae": vae}
-    metadata |= {"history": history or []}
-    weights = mdn_rnn.state_dict()
-    save_tensors(path, weights, **described("mdn_rnn", weights), **metadata)
+    settings, weights = dataclasses.asdict(config.mdn_rnn), mdn_rnn.state_dict()
+    metadata |= {"mdn_rnn": settings, "vae": vae, "history": history or []}
+    save_tensors(path, weights, kind="mdn_rnn", weights=checksum_of_tensors(weights), **metadata)
 
 
 @torch.random.fork_rng([])
@@ -104,41 +99,27 @@ def load_controller(path: Path) -> tuple[np.ndarray, dict]:
 def load_kind(path: Path, kind: str, *required: str) -> tuple[dict[str, torch.Tensor], dict]:
     """Read a file that must be of this kind and have these entries of metadata."""
     tensors, metadata = load_tensors(path, REMEDY)
-    check_kind(path, metadata, kind)
-    if missing := [name for name in required if name not in metadata]:
-        raise ValueError(f"{path} is not a file of this kind: it lacks {missing[0]!r}; {REMEDY}")
-    return tensors, metadata
-
-
-def check_kind(path: Path, metadata: dict, kind: str) -> None:
-    """Raise ValueError unless a file's metadata says that it is of this kind."""
     if "part" in metadata:
         raise ValueError(f"{path} was written by stad_lab 0.1: use that version, or train again")
     if metadata.get("kind") != kind:
         raise ValueError(f"{path} holds {metadata.get('kind')!r}: expected a file of {kind!r}")
-
-
-def described(kind: str, weights: dict[str, torch.Tensor]) -> dict:
-    """The kind and the checksum of some weights, for their metadata."""
-    return {"kind": kind, "weights": checksum_of_tensors(weights)}
+    if missing := [name for name in required if name not in metadata]:
+        raise ValueError(f"{path} is not a file of this kind: it lacks {missing[0]!r}; {REMEDY}")
+    return tensors, metadata
 
 
 def check_belongs(path: Path, metadata: dict, **checksums: str) -> None:
     """Raise ValueError unless a file names the V (and M) of these checksums as its own."""
     for part, checksum in checksums.items():
         if metadata.get(part) != checksum:
-            raise ValueError(
-                f"{path} was made with another {part} than the one beside it: give V, M and C of"
-                " one run"
-            )
+            message = f"{path} was made with another {part} than the one beside it"
+            raise ValueError(f"{message}: give V, M and C of one run")
 
 
 def load_world_model(folder: Path) -> WorldModel:
     """V and M of a run; read again only when the files have changed.
 
-    Raises:
-        FileNotFoundError: a file is missing.
-        ValueError: a file is damaged, or they do not belong together.
+    FileNotFoundError if one is missing; ValueError if one is damaged, or of another run.
     """
     files = [Path(folder) / name for name in (VAE_FILE, MDN_RNN_FILE)]
     times = tuple(file.stat().st_mtime_ns if file.exists() else 0 for file in files)

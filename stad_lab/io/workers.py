@@ -14,15 +14,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    CancelledError,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
+from concurrent.futures import CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -45,26 +38,6 @@ CANCELLED: contextvars.ContextVar[threading.Event | None] = contextvars.ContextV
 
 class TaskError(RuntimeError):
     """A task failed in a worker, or none was finished for too long."""
-
-
-class WorkerThreads(ThreadPoolExecutor):
-    """A pool of threads whose rollouts can be stopped.
-
-    Raises:
-        ValueError: fewer than 1 thread.
-    """
-
-    def __init__(self, count: int):
-        super().__init__(check_count(count), "driver")
-        self.cancelled = threading.Event()
-
-    def submit(self, function: Callable, /, *arguments, **named) -> Future:
-        """As for every Executor."""
-        return super().submit(self._run, function, *arguments, **named)
-
-    def _run(self, function: Callable, *arguments, **named) -> object:
-        CANCELLED.set(self.cancelled)
-        return function(*arguments, **named)
 
 
 def check_cancelled() -> None:
@@ -90,16 +63,18 @@ def worker_threads(count: int, given: Executor | None = None) -> Iterator[Execut
     if given is not None:
         yield given
         return
-    executor, threads = WorkerThreads(count), torch.get_num_threads()
+    cancelled, threads = threading.Event(), torch.get_num_threads()
+    count = check_count(count)
+    executor = futures.ThreadPoolExecutor(count, "driver", CANCELLED.set, (cancelled,))
     try:
         yield executor
     finally:
-        executor.cancelled.set()
+        cancelled.set()
         executor.shutdown(cancel_futures=True)
         torch.set_num_threads(threads)  # tasks set it to 1, for all threads that come later
 
 
-class WorkerProcesses(ProcessPoolExecutor):
+class WorkerProcesses(futures.ProcessPoolExecutor):
     """A pool of processes that must load the same stad_lab as their parent."""
 
     def submit(self, function: Callable, /, *arguments, **named) -> Future:
@@ -110,10 +85,9 @@ class WorkerProcesses(ProcessPoolExecutor):
 def run_here(home: str, function: Callable, *arguments, **named) -> object:
     """Call a function in a worker; ValueError if it has loaded another stad_lab than `home`."""
     if stad_lab.__file__ != home:
-        raise ValueError(
-            f"a worker process loaded {stad_lab.__file__}, its parent {home}: install the one that"
-            " you use instead of changing sys.path"
-        )
+        remedy = "install the one that you use instead of changing sys.path"
+        found = f"a worker process loaded {stad_lab.__file__}, its parent {home}"
+        raise ValueError(f"{found}: {remedy}")
     return function(*arguments, **named)
 
 
@@ -122,10 +96,7 @@ def worker_processes(count: int, given: Executor | None = None) -> Iterator[Exec
     """A pool of `count` fresh processes for a `with` block; or the given executor.
 
     The processes ignore Ctrl-C and end with their parent. If the block is left by an interrupt or
-    an error, they are killed.
-
-    Raises:
-        ValueError: fewer than 1 process, or a script that workers cannot import.
+    an error, they are killed. ValueError for a script that workers cannot import.
     """
     if given is not None:
         yield given
@@ -152,10 +123,8 @@ def check_script() -> None:
     """Raise ValueError if workers, which import the running script, would run all of it again."""
     script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
     if script.is_file() and "__main__" not in script.read_text(errors="replace"):
-        raise ValueError(
-            f"{script} would run again in every worker process: put what it does below a line"
-            ' `if __name__ == "__main__":`'
-        )
+        remedy = 'put what it does below a line `if __name__ == "__main__":`'
+        raise ValueError(f"{script} would run again in every worker process: {remedy}")
 
 
 def start_worker() -> None:
@@ -172,10 +141,7 @@ def end_with_parent() -> None:
 
 
 def single_thread() -> None:
-    """Compute on one thread from now on: tasks fill the cores, and last bits depend on threads.
-
-    Tasks call it, so that it holds in the workers of any executor.
-    """
+    """Compute on one thread from now on: tasks fill the cores, and last bits depend on threads."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
 
@@ -225,14 +191,11 @@ def task_errors(name: str) -> Iterator[None]:
     except (ValueError, OSError):
         raise
     except CancelledError as error:
-        raise TaskError(
-            f"{name} was cancelled, as when a scheduler is lost: the same command continues"
-        ) from error
+        message = "was cancelled, as when a scheduler is lost: the same command continues"
+        raise TaskError(f"{name} {message}") from error
     except BrokenProcessPool as error:
-        raise TaskError(
-            f"{name}: a worker process ended abruptly; was it killed, or is memory short? The same"
-            " command continues"
-        ) from error
+        message = "a worker process ended abruptly; was it killed, or is memory short?"
+        raise TaskError(f"{name}: {message} The same command continues") from error
     except Exception as error:
         raise TaskError(f"{name} failed in a worker: {type(error).__name__}: {error}") from error
 
@@ -240,7 +203,7 @@ def task_errors(name: str) -> Iterator[None]:
 def finished_first(waiting: dict[Future, int], patience: float) -> set[Future]:
     """The futures that are finished, as soon as there are any. TaskError after `patience`."""
     for _ in range(SLICES):
-        done, _ = wait(waiting, patience / SLICES, return_when=FIRST_COMPLETED)
+        done, _ = futures.wait(waiting, patience / SLICES, return_when=futures.FIRST_COMPLETED)
         if done:
             return done
     raise TaskError(f"no worker has finished anything for {patience:.0f} seconds: see if they live")

@@ -2,8 +2,8 @@
 
 A folder holds two files for each episode, `00042.frames.npy` (uint8) and `00042.actions.npy`
 (float32), and `manifest.json` with the configuration and all checksums. An episode enters the
-manifest when its files are complete, so an interrupted collection continues where it stopped.
-Frames are read when they are needed: a dataset may be larger than the memory.
+manifest when its files are complete, so an interrupted collection continues. Frames are read when
+they are needed: a dataset may be larger than the memory.
 """
 
 import dataclasses
@@ -73,40 +73,26 @@ def random_start(
     """A car where episode `index` of the random driver begins, and the driver.
 
     Most episodes start moving on a random tile; otherwise the data would hold little but the first
-    bend and grass.
-
-    Args:
-        use: whose tracks to take, a key of TRACK_RANGES.
-        shows: what the car sees, as for `Cars`.
+    bend and grass. `use` is a key of TRACK_RANGES, `shows` what the car sees, as for `Cars`.
     """
     rng = random_stream("random driver", config.seed, index)
     cars = Cars(1, shows, bar=shows == "observation" or not config.data.crop_bar)
-    cars.reset([track_of(config, index, use)])
+    cars.reset([track_seeds(use, config.data.episodes, config.seed)[index]])
     if rng.random() < config.data.random_starts:
-        cars.place(
-            0,
-            tile=int(rng.integers(10_000)),
-            speed=rng.uniform(0, 90),
-            turn=0.15 * rng.standard_normal(),
-            offset=rng.uniform(-0.7, 0.7),
-        )
+        tile, speed, turn = int(rng.integers(10_000)), rng.uniform(0, 90), rng.standard_normal()
+        cars.place(0, tile=tile, speed=speed, turn=0.15 * turn, offset=rng.uniform(-0.7, 0.7))
     return cars, RandomDriver(rng)
-
-
-def track_of(config: Config, index: int, use: str = "collect") -> int:
-    """The track of episode `index` of the random driver."""
-    return track_seeds(use, config.data.episodes, config.seed)[index]
 
 
 def drive_randomly(config: Config, index: int) -> Episode:
     """Drive episode `index` of the random driver. Runs in a worker."""
     cars, driver = random_start(config, index)
     pair = record_frames(driver, cars, max_frames=config.data.episode_frames)
-    return *pair, track_of(config, index)
+    return *pair, track_seeds("collect", config.data.episodes, config.seed)[index]
 
 
 def record_frames(driver: Driver, cars: Cars, **limits) -> tuple[np.ndarray, np.ndarray]:
-    """Drive one episode and keep its frames and the action taken on each."""
+    """Drive one episode; returns its frames and the action taken on each."""
     frames, actions = [], []
 
     def observe(_: np.ndarray, seen: np.ndarray, action: np.ndarray) -> None:
@@ -118,13 +104,10 @@ def record_frames(driver: Driver, cars: Cars, **limits) -> tuple[np.ndarray, np.
 
 
 def collect(config: Config, folder: Path, executor: Executor | None = None) -> bool:
-    """Collect the random driver's episodes into `folder`, or those that are missing.
+    """Collect the random driver's missing episodes into `folder`; False if there are none.
 
     Args:
         executor: who drives; None for `config.processes` threads of this machine.
-
-    Returns:
-        False if everything was there already.
 
     Raises:
         ValueError: the folder holds a dataset of another configuration.
@@ -153,14 +136,13 @@ def collect_episodes(
     longest: list[int],
     executor: Executor,
 ) -> bool:
-    """Drive the episodes that are not in `folder` yet, one for each task, and write their files.
+    """Drive the episodes that are not in `folder` yet, one for each task; False if there are none.
 
     Args:
         made_with: what the dataset depends on; a folder of another one is refused.
-        drive_episode: called with a task.
         longest: frames that each episode has at most.
 
-    Returns and raises as `collect`.
+    Raises as `collect`.
     """
     folder = Path(folder)
     if len(read_manifest(folder, made_with)["episodes"]) == len(tasks):
@@ -226,13 +208,10 @@ def check_disk(folder: Path, needed: int) -> None:
 
 
 class EpisodeFrames(Sequence):
-    """The frames of every episode, uint8 (T, 64, 64, 3), read from the disk at every access.
-
-    Memory-mapped files would count as the process's memory once they are touched.
-    """
+    """The frames of every episode, uint8 (T, 64, 64, 3), read from the disk at every access."""
 
     def __init__(self, paths: list[Path]):
-        self.paths = paths
+        self.paths = paths  # not memory-mapped: that counts as our memory once it is touched
 
     def __len__(self) -> int:
         return len(self.paths)
@@ -250,7 +229,7 @@ class EpisodeFrames(Sequence):
 
 
 class Dataset:
-    """The dataset in a folder, read-only. Reading it checks every file once.
+    """The dataset in a folder, read-only. Opening it checks every file once.
 
     Attributes:
         frames: uint8 (T, 64, 64, 3) for each episode, read at every access.
@@ -258,8 +237,7 @@ class Dataset:
         checksum: of the whole dataset; V keeps that of the one it was trained on.
 
     Raises:
-        FileNotFoundError: no dataset, or a file is missing.
-        ValueError: the collection is not complete, or a file is damaged.
+        FileNotFoundError, ValueError: it is missing, incomplete or damaged.
     """
 
     def __init__(self, folder: Path):
@@ -272,38 +250,31 @@ class Dataset:
         entries = self.manifest["episodes"]
         self.checksum = dataset_checksum(self.manifest)
         for entry in entries:
-            self._read(entry, "frames", (entry["frames"], FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+            self._read(entry, "frames", (FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
         paths = [episode_file(self.folder, entry["index"], "frames") for entry in entries]
         self.frames = EpisodeFrames(paths)
-        self.actions = [
-            self._read(entry, "actions", (entry["frames"], 3), np.float32) for entry in entries
-        ]
+        self.actions = [self._read(entry, "actions", (3,), np.float32) for entry in entries]
         lengths = [entry["frames"] for entry in entries]
         self.episode = np.repeat(np.arange(len(lengths)), lengths)  # of every frame in the dataset
         self.moment = np.concatenate([np.arange(length) for length in lengths])
 
     def _read(self, entry: dict, name: str, shape: tuple[int, ...], dtype) -> np.ndarray:
-        path = episode_file(self.folder, entry["index"], name)
+        path, shape = episode_file(self.folder, entry["index"], name), (entry["frames"], *shape)
         remedy = f"delete {self.folder} and collect again"
         content = read_bytes(path, remedy)
         if checksum(content) != entry[f"{name}_sha256"]:
             raise ValueError(f"{path} is damaged, its checksum is not the manifest's: {remedy}")
         array = np.load(io.BytesIO(content), allow_pickle=False)
         if array.shape != shape or array.dtype != dtype:
-            raise ValueError(
-                f"{path} holds {array.dtype} {array.shape}, the manifest says {shape}: {remedy}"
-            )
+            found = f"{array.dtype} {array.shape}"
+            raise ValueError(f"{path} holds {found}, the manifest says {shape}: {remedy}")
         return array
 
     def __len__(self) -> int:
         return len(self.episode)
 
     def pairs(self, indices: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
-        """Frames and those to subtract from them, for indices into the whole dataset.
-
-        Returns:
-            Two uint8 arrays (n, 64, 64, 3).
-        """
+        """Some frames and those to subtract from them, uint8 (n, 64, 64, 3) each."""
         episodes, moments = self.episode[indices], self.moment[indices]
         before = earlier_index(moments, stride)
         frames, earlier = np.empty((2, len(indices), FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
@@ -337,8 +308,7 @@ def dataset_checksum(manifest: dict) -> str:
 def check_seen(path: Path, seen: str | None, folder: Path) -> None:
     """Raise ValueError if the weights in `path` were trained on another dataset than `folder`'s.
 
-    Args:
-        seen: checksum of the dataset that they were trained on; None if it is not known.
+    `seen` is the checksum of the dataset that they were trained on, or None if it is not known.
     """
     manifest = Path(folder) / MANIFEST
     if seen and manifest.exists() and seen != dataset_checksum(load_manifest(manifest)):

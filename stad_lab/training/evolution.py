@@ -1,10 +1,9 @@
 """CMA-ES over C: ask for a population, let it drive, tell the returns, validate, log.
 
-The log is the state. CMA-ES is deterministic: its mean, covariance, step size and random state
-follow from the seed and the fitnesses that it was told. A resumed run tells a new strategy every
-logged generation again, which takes seconds and no driving, and is then exactly where the old one
-was, on the same machine and with the same versions. All of it runs on one thread, because the last
-bits of an eigendecomposition depend on the number of threads.
+The log is the state: CMA-ES's mean, covariance, step size and random state follow from the seed and
+the fitnesses that it was told. A resumed run tells a new strategy every logged generation again,
+which takes seconds and no driving, and continues bit-identically on the same machine and versions.
+All of it runs on one thread: the last bits of an eigendecomposition depend on how many there are.
 """
 
 import dataclasses
@@ -12,7 +11,6 @@ import math
 import zlib
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,30 +20,23 @@ from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent, drive
 from stad_lab.config import STREAMS, Config, EvolutionConfig, check_same, track_seeds
+from stad_lab.io import weights
 from stad_lab.io.files import load_json, locked, save_json
-from stad_lab.io.weights import (
-    CONTROLLER_FILE,
-    WorldModel,
-    check_belongs,
-    load_controller,
-    load_world_model,
-    save_controller,
-)
+from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_world_model
 from stad_lab.io.workers import run_in_order, single_thread, worker_threads
 from stad_lab.training.subspace import SearchSpace, search_space
 
 if TYPE_CHECKING:
-    import cma
+    from cma import CMAEvolutionStrategy as Strategy
 
 LOG = "evolution.json"
 # A hard track may be replayed from the last so many generations, without the very last ones.
 REMEMBERED, RESTING = 20, 4
-MAY_CHANGE = ("generations",)  # between a run and its continuation
 
 Watch = Callable[[list[dict]], None]
 
 
-@dataclass
+@dataclasses.dataclass
 class Evolution:
     """A CMA-ES run: its configuration, its log, and the state that follows from the log."""
 
@@ -54,19 +45,18 @@ class Evolution:
     world_model: WorldModel
     space: SearchSpace
     log: dict
-    strategy: "cma.CMAEvolutionStrategy"
-    means: list[np.ndarray]
-    """The mean after every generation, float64 (dimensions,)."""
+    strategy: "Strategy"
+    means: list[np.ndarray]  # after every generation, float64 (dimensions,)
 
-    def controller(self) -> np.ndarray:
-        """C as found so far, float64 (parameters,)."""
-        return self.space.expand(averaged_mean(self.means, self.config.evolution))
+    def controller(self, generation: int | None = None) -> np.ndarray:
+        """C as found so far, or up to a generation: float64 (parameters,)."""
+        return self.space.expand(averaged_mean(self.means[:generation], self.config.evolution))
 
 
 def evolve(
     config: Config, folder: Path, executor: Executor | None = None, watch: Watch | None = None
 ) -> bool:
-    """Evolve C for the V and M in `folder`; writes the log after every generation, and the best C.
+    """Evolve C for the V and M in `folder`; False if the run was complete already.
 
     All agents of a generation drive the same tracks; their fitness is their mean return. Every few
     generations the averaged mean of CMA-ES drives the validation tracks, and the best one so far is
@@ -74,11 +64,7 @@ def evolve(
 
     Args:
         executor: who drives; None for `config.processes` threads of this machine.
-        watch: called with the log's generations after each of them, and with those of an earlier
-            call.
-
-    Returns:
-        False if the run was complete already.
+        watch: called with the log's generations after each, and when a run is resumed.
 
     Raises:
         ValueError: a file in `folder` is damaged or of another run, or an action is not finite.
@@ -96,8 +82,7 @@ def evolve(
     with locked(folder), threadpool_limits(1):
         run = resume(config, folder, world_model, log)
         if log["best"] and kept != log["best"]["generation"]:
-            best = averaged_mean(run.means[: log["best"]["generation"]], settings)
-            keep_controller(run, run.space.expand(best))
+            keep_controller(run, run.controller(log["best"]["generation"]))
         with worker_threads(config.processes, executor) as executor:
             source = hand_out(executor, folder)
             label = f"evolve C ({config.variant})"
@@ -129,62 +114,60 @@ def run_generation(run: Evolution, executor: Executor, source: Any) -> None:
 
 
 def read_log(config: Config, folder: Path, world_model: WorldModel) -> dict:
-    """The log of the run in `folder`, or a new one.
-
-    Raises:
-        ValueError: it is damaged, of another run, or longer than asked for.
-    """
-    path, seed = folder / LOG, config.evolution.seed
-    new = {
-        "kind": "evolution",
-        "variant": config.variant,
-        "seed": config.seed,
-        "evolution": dataclasses.asdict(config.evolution),
-        "random": {"entropy": config.seed, "spawn_key": [STREAMS.index("evolution"), seed]},
-        **world_model.checksums,
-        "best": None,
-    }
+    """The log of the run in `folder`, or a new one; ValueError if it is damaged or does not fit."""
+    path, settings = folder / LOG, dataclasses.asdict(config.evolution)
+    made_with = {"variant": config.variant, "seed": config.seed, "evolution": settings}
     if not path.exists():
-        return new | {"generations": []}
+        spawn_key = [STREAMS.index("evolution"), config.evolution.seed]
+        return {
+            "kind": "evolution",
+            **made_with,
+            "random": {"entropy": config.seed, "spawn_key": spawn_key},
+            **world_model.checksums,
+            "best": None,
+            "generations": [],
+        }
     log = load_json(path, "move it and the controller away to evolve C again", kind="evolution")
-    asked = {name: new[name] for name in ("variant", "seed", "evolution")}
-    asked["evolution"] = {
-        name: value for name, value in asked["evolution"].items() if name not in MAY_CHANGE
-    }
-    check_same(path, log, asked)
-    check_belongs(path, log, **world_model.checksums)
-    if len(log["generations"]) > config.evolution.generations:
+    fixed = {name: value for name, value in settings.items() if name != "generations"}
+    check_same(path, log, made_with | {"evolution": fixed})
+    weights.check_belongs(path, log, **world_model.checksums)
+    done, asked = len(log["generations"]), config.evolution.generations
+    if done > asked:
         raise ValueError(
-            f"{path} holds {len(log['generations'])} generations, and now evolution.generations="
-            f"{config.evolution.generations}: ask for at least as many, or choose another folder"
+            f"{path} holds {done} generations, and now evolution.generations={asked}: ask for at"
+            " least as many, or choose another folder"
         )
-    return log | {"evolution": new["evolution"]}
+    return log | {"evolution": settings}
 
 
+@threadpool_limits.wrap(limits=1)
 def resume(config: Config, folder: Path, world_model: WorldModel, log: dict) -> Evolution:
     """The run as its log left it.
 
     Raises:
-        ValueError: the log was changed, comes from another machine, or the search space is not
-            that of the log.
+        ValueError: the log was changed, comes from another machine, or its last validated C does
+            not follow from the search space in `folder`.
     """
-    space = search_space(config, world_model, folder)
+    space, generations = search_space(config, world_model, folder), log["generations"]
     strategy, means = replay(space.first, config.evolution, log)
-    check_space(folder, config.evolution, space, log["generations"], means)
-    return Evolution(config, folder, world_model, space, log, strategy, means)
+    run = Evolution(config, folder, world_model, space, log, strategy, means)
+    last = max((n for n, entry in enumerate(generations, 1) if "validation" in entry), default=0)
+    if last:
+        validated = generations[last - 1]["validation"]["controller_checksum"]
+        if crc(run.controller(last)) != validated:
+            raise ValueError(
+                f"{folder} holds other components, or another first C, than the run in"
+                f" {folder / LOG} had: restore the right files, or start in a new folder"
+            )
+    return run
 
 
-def make_strategy(
-    start: np.ndarray, settings: EvolutionConfig, random: dict
-) -> "cma.CMAEvolutionStrategy":
-    """pycma's strategy from `start`, float64 (dimensions,).
+def make_strategy(start: np.ndarray, settings: EvolutionConfig, random: dict) -> "Strategy":
+    """pycma's strategy from `start`, float64 (dimensions,), with `random` as the seed.
 
     The rule that adapts the step size is set explicitly: pycma's default has changed between its
     versions, and depends on the number of dimensions. CSA compares the length of the mean's path
     with that of a random walk; TPA compares two candidates ahead of the mean and behind it.
-
-    Args:
-        random: entropy and spawn key of the strategy's own random numbers.
     """
     import cma  # here, because it takes two seconds and drivers do not need it
     from cma import sigma_adaptation
@@ -202,9 +185,7 @@ def make_strategy(
     return cma.CMAEvolutionStrategy(start, settings.sigma, options)
 
 
-def ask(
-    strategy: "cma.CMAEvolutionStrategy", settings: EvolutionConfig, generation: int
-) -> np.ndarray:
+def ask(strategy: "Strategy", settings: EvolutionConfig, generation: int) -> np.ndarray:
     """The population of a generation, float64 (agents, dimensions).
 
     With `sigma_decay` the step size follows a schedule: in hundreds of dimensions CMA-ES takes
@@ -215,9 +196,7 @@ def ask(
     return np.array(strategy.ask())
 
 
-def tell(
-    strategy: "cma.CMAEvolutionStrategy", population: np.ndarray, returns: list, means: list
-) -> None:
+def tell(strategy: "Strategy", population: np.ndarray, returns: list, means: list) -> None:
     """Tell CMA-ES, which minimises, each agent's returns on its tracks; appends to the means."""
     strategy.tell(population, [-np.mean(own) for own in returns])
     means.append(strategy.mean.copy())
@@ -226,11 +205,10 @@ def tell(
 @threadpool_limits.wrap(limits=1)
 def replay(
     start: np.ndarray, settings: EvolutionConfig, log: dict
-) -> tuple["cma.CMAEvolutionStrategy", list[np.ndarray]]:
+) -> tuple["Strategy", list[np.ndarray]]:
     """A strategy that was told every logged generation, and its mean after each.
 
-    Raises:
-        ValueError: a mean is not the logged one.
+    ValueError if a mean is not the logged one.
     """
     strategy, means = make_strategy(start, settings, log["random"]), []
     for number, entry in enumerate(log["generations"]):
@@ -239,57 +217,26 @@ def replay(
         if crc(strategy.mean) != entry["mean_checksum"]:
             raise ValueError(
                 f"replaying the log gives another mean in generation {number + 1}: the log was"
-                " changed, or made on another machine or by other versions of cma and numpy. Start"
-                " in a new folder"
+                " changed, or is of another machine or other versions. Start in a new folder"
             )
     return strategy, means
 
 
-def check_space(
-    folder: Path,
-    settings: EvolutionConfig,
-    space: SearchSpace,
-    generations: list[dict],
-    means: list[np.ndarray],
-) -> None:
-    """Raise ValueError if the last validated C does not follow from this search space."""
-    last = max((n for n, entry in enumerate(generations, 1) if "validation" in entry), default=0)
-    if not last:
-        return
-    with threadpool_limits(1):
-        found = crc(space.expand(averaged_mean(means[:last], settings)))
-    if found != generations[last - 1]["validation"]["controller_checksum"]:
-        raise ValueError(
-            f"{folder} holds other components, or another first C, than the run in {folder / LOG}"
-            " had: restore the right files, or start in a new folder"
-        )
-
-
 def averaged_mean(means: list[np.ndarray], settings: EvolutionConfig) -> np.ndarray:
-    """The average of the last `averaged_share` of the means, float64 (dimensions,).
-
-    The noise of the returns moves the mean around; averaging removes it (Polyak averaging).
-    """
+    """Polyak average of the last `averaged_share` of the means, float64 (dimensions,)."""
     return np.mean(means[-max(1, round(settings.averaged_share * len(means))) :], axis=0)
 
 
 def kept_generation(folder: Path, log: dict) -> int | None:
-    """The generation of the kept C, by the log; None if none is kept.
-
-    Raises:
-        ValueError: it is damaged, or not in the log.
-    """
+    """The generation of the kept C; None if none is kept, ValueError if it is not in the log."""
     path = folder / CONTROLLER_FILE
     if not path.exists():
         return None
-    parameters, metadata = load_controller(path)
-    validated = {
-        entry["generation"]: entry["validation"]["controller_checksum"]
-        for entry in log["generations"]
-        if "validation" in entry
-    }
+    parameters, metadata = weights.load_controller(path)
     generation = metadata.get("generation")
-    if crc(parameters) != validated.get(generation):
+    entries = [entry for entry in log["generations"] if entry["generation"] == generation]
+    validations = [entry["validation"] for entry in entries if "validation" in entry]
+    if [crc(parameters)] != [one["controller_checksum"] for one in validations]:
         raise ValueError(
             f"{path} does not come from the run in {folder / LOG}: move it away, and the same"
             " command writes the right one"
@@ -300,10 +247,9 @@ def kept_generation(folder: Path, log: dict) -> int | None:
 def note_best(log: dict) -> bool:
     """Note the generation with the best validation; True if it is the last one."""
     last = log["generations"][-1]
-    best = log["best"]["validation"] if log["best"] else -math.inf
-    if "validation" not in last or last["validation"]["mean"] <= best:
+    mean = last["validation"]["mean"] if "validation" in last else -math.inf
+    if mean <= (log["best"]["validation"] if log["best"] else -math.inf):
         return False
-    mean = last["validation"]["mean"]
     log["best"] = {"generation": last["generation"], "validation": mean}
     return True
 
@@ -311,7 +257,7 @@ def note_best(log: dict) -> bool:
 def keep_controller(run: Evolution, controller: np.ndarray) -> None:
     """Write C, float64 (parameters,), with its generation and the checksums of V and M."""
     metadata = {"variant": run.config.variant, **run.log["best"], **run.world_model.checksums}
-    save_controller(run.folder / CONTROLLER_FILE, controller, **metadata)
+    weights.save_controller(run.folder / CONTROLLER_FILE, controller, **metadata)
 
 
 def crc(vector: np.ndarray) -> int:
@@ -322,11 +268,10 @@ def crc(vector: np.ndarray) -> int:
 def generation_tracks(config: Config, earlier: list[dict]) -> list[int]:
     """The tracks of the generation after the `earlier` ones: new ones, and some hard ones again.
 
-    Ranks do not say by how much an agent is better: on an easy track the fastest agents win, even
-    if they lose hundreds of points elsewhere. So a share `replay_share` of the tracks is replayed:
-    those on which the mean agent did worst when it last drove them, among the last REMEMBERED
-    generations without the last RESTING ones. It is a simple form of prioritized level replay
-    (Jiang, Grefenstette and Rocktaschel, 2021).
+    On an easy track the fastest agents win, even if they lose hundreds of points elsewhere. So a
+    share `replay_share` of the tracks is replayed: those on which the mean agent did worst when it
+    last drove them, among the last REMEMBERED generations without the last RESTING ones. It is a
+    simple form of prioritized level replay (Jiang, Grefenstette and Rocktaschel, 2021).
     """
     settings, number = config.evolution, len(earlier)
     new = track_seeds("evolve", settings.tracks, config.seed, number, settings.seed)
@@ -347,12 +292,7 @@ def drive_generation(
 ) -> dict:
     """Let every agent drive the next generation's tracks; returns its entry of the log.
 
-    Args:
-        source: what `hand_out` returned.
-        population: of controllers, float64 (agents, parameters).
-
-    Returns:
-        "generation", "tracks", "returns" [agent][track] and "frames".
+    `source` is from `hand_out`; `population` holds controllers, float64 (agents, parameters).
     """
     tracks = generation_tracks(config, earlier)
     agents = np.repeat(population, len(tracks), axis=0)
@@ -381,18 +321,12 @@ def validate(executor: Executor, source: Any, config: Config, controller: np.nda
 
 
 def drive_parallel(
-    executor: Executor,
-    source: Any,
-    settings: EvolutionConfig,
-    parameters: np.ndarray,
-    tracks: list[int],
+    executor: Executor, source: Any, settings: EvolutionConfig, parameters: np.ndarray, tracks: list
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Drive one episode for each row of `parameters`, in groups of at most `settings.cars`.
+    """Returns and lengths in frames, (episodes,), of an episode for each row of `parameters`.
 
-    The groups do not depend on the number of threads, so neither do the numbers.
-
-    Returns:
-        The returns and the lengths in frames, (episodes,).
+    The cars drive in groups of at most `settings.cars`. The groups do not depend on the number of
+    threads, so neither do the results.
     """
     size = min(settings.cars, math.ceil(len(tracks) / 2))  # so that two cores have work
     groups = [slice(start, start + size) for start in range(0, len(tracks), size)]
@@ -416,10 +350,9 @@ def drive_group(
 
 
 def hand_out(executor: Executor, folder: Path) -> Any:
-    """What tells a worker which V and M to drive with.
+    """What tells a worker which V and M to drive with: on this machine, their folder.
 
-    On this machine that is their folder. On a cluster, which may share no disk, V and M themselves
-    are brought once to every worker by the executor's `share`.
+    A cluster may share no disk: its executor's `share` brings V and M once to every worker.
     """
     share = getattr(executor, "share", None)
     return share(load_world_model(folder)) if share else Path(folder)
@@ -432,9 +365,6 @@ def make_agent(source: Path | WorldModel, parameters: np.ndarray) -> Agent:
 
 
 def fitness_curves(generations: list[dict]) -> np.ndarray:
-    """Worst, mean and best fitness of every generation, (3, generations): the paper's figures.
-
-    A fitness is an agent's mean return over its tracks.
-    """
+    """Worst, mean and best fitness (an agent's mean return), float64 (3, generations)."""
     fitness = [np.mean(entry["returns"], axis=1) for entry in generations]
     return np.array([[own.min(), own.mean(), own.max()] for own in fitness]).T

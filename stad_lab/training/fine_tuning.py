@@ -1,10 +1,9 @@
 """Fine-tuning: CMA-ES continues from a finished C, with more tracks for each agent.
 
-CMA-ES ranks its candidates. Where each drives one track in a generation, the fastest lead on nearly
-all tracks, and a failure on one track in twenty rarely counts. In the fine-tuning stage each agent
-drives eight tracks, and one failure weighs more in their mean than any gain in speed. It costs
-eight times the episodes for an agent, so it comes last, when small steps from a good C suffice.
-Nothing is collected or trained.
+CMA-ES ranks its candidates. Where each drives one track in a generation, the fastest lead, and a
+failure on one track in twenty rarely counts. In the fine-tuning stage each drives eight tracks, and
+one failure weighs more in their mean than any gain in speed. That takes eight times the episodes,
+so it comes last, when small steps from a good C suffice. Nothing is collected or trained.
 """
 
 import dataclasses
@@ -15,15 +14,9 @@ import numpy as np
 
 from stad_lab.agent import load_agent
 from stad_lab.config import Config, check_same
+from stad_lab.io import weights
 from stad_lab.io.files import copy_file
-from stad_lab.io.weights import (
-    CONTROLLER_FILE,
-    MDN_RNN_FILE,
-    VAE_FILE,
-    check_belongs,
-    load_controller,
-    load_world_model,
-)
+from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE
 from stad_lab.training.evolution import evolve
 from stad_lab.training.pipeline import read_finished, run_stages
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE, load_start, save_start
@@ -47,9 +40,7 @@ OPEN = (*FINE_TUNING["evolution"], "seed", "validation_tracks", "cars")
 def fine_tuning_config(earlier: str | Path, **changes) -> Config:
     """The configuration of a fine-tuning of the run in `earlier`, with further changes.
 
-    Raises:
-        ValueError: an unknown field, or a value out of range.
-        FileNotFoundError: no run.
+    ValueError for an unknown field or a value out of range; FileNotFoundError without a run.
     """
     record = read_finished(Path(earlier))
     return Config.from_dict(record["config"]).replace(**FINE_TUNING).replace(**changes)
@@ -58,16 +49,11 @@ def fine_tuning_config(earlier: str | Path, **changes) -> Config:
 def fine_tune(
     config: Config, earlier: str | Path, folder: str | Path, executor: Executor | None = None
 ) -> bool:
-    """Continue CMA-ES from the C of the run in `earlier`; an interrupted fine-tuning continues.
+    """Continue CMA-ES from the C of the run in `earlier`; False if everything was finished already.
 
     `folder` becomes a run of its own, with copies of V and M and with the earlier run's record.
 
-    Args:
-        config: as `fine_tuning_config` makes it.
-        executor: who drives; None for `config.processes` processes of this machine.
-
-    Returns:
-        False if everything was finished already.
+    `config` is made by `fine_tuning_config`; `executor` is as for `evolve`.
 
     Raises:
         ValueError: a setting outside OPEN is not the earlier run's, that run is damaged or not
@@ -90,17 +76,13 @@ def fine_tune(
 
 
 def begin(config: Config, earlier: Path, folder: Path) -> bool:
-    """Copy V, M and the components of the earlier run, and write its C as the first one.
-
-    Returns:
-        False if that was done already.
-    """
+    """Copy the earlier run's V, M and components, and its C as the first one; False if done."""
     for name in (VAE_FILE, MDN_RNN_FILE, COMPONENTS_FILE):
         if (earlier / name).exists() and not (folder / name).exists():
             copy_file(earlier / name, folder)
-    path, world_model = folder / START_FILE, load_world_model(folder)
-    parameters, metadata = load_controller(earlier / CONTROLLER_FILE)
-    check_belongs(earlier / CONTROLLER_FILE, metadata, **world_model.checksums)
+    path, world_model = folder / START_FILE, weights.load_world_model(folder)
+    parameters, metadata = weights.load_controller(earlier / CONTROLLER_FILE)
+    weights.check_belongs(earlier / CONTROLLER_FILE, metadata, **world_model.checksums)
     if path.exists():
         if not np.array_equal(load_start(path, world_model), parameters):
             raise ValueError(f"{folder} continues from another C than that of {earlier}")

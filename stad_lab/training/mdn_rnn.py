@@ -10,15 +10,9 @@ from tqdm.auto import tqdm
 
 from stad_lab.agent import encode_episode
 from stad_lab.config import Config, check_same, random_stream
+from stad_lab.io import weights
 from stad_lab.io.files import locked
-from stad_lab.io.weights import (
-    MDN_RNN_FILE,
-    VAE_FILE,
-    check_belongs,
-    load_mdn_rnn,
-    load_vae,
-    save_mdn_rnn,
-)
+from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_vae
 from stad_lab.models.mdn_rnn import MDNRNN, mdn_loss
 from stad_lab.models.vae import VAE
 from stad_lab.training.dataset import Dataset
@@ -33,29 +27,16 @@ HELDOUT_SEQUENCES = 64  # on which the loss is measured
 class Latents:
     """What M is trained on: episodes as V encodes them, with their actions."""
 
-    encoded: list[np.ndarray]
-    """mu and logvar of each episode, float32 (2, T, latent_size)."""
-    actions: list[np.ndarray]
-    """float32 (T, 3) of each episode."""
-    first_heldout: int
-    """From this episode on they are held out."""
-    vae: str
-    """Checksum of the V that encoded them."""
+    encoded: list[np.ndarray]  # mu and logvar of each episode, float32 (2, T, latent_size)
+    actions: list[np.ndarray]  # of each episode, float32 (T, 3)
+    first_heldout: int  # from this episode on they are held out
+    vae: str  # checksum of the V that encoded them
 
 
 def train_mdn_rnn(config: Config, dataset: Callable[[], Dataset], folder: Path) -> bool:
-    """Train M on the dataset as V, in `folder`, encodes it; an interrupted training continues.
+    """Train M on the dataset as V, in `folder`, encodes it; False if M was there already.
 
-    Args:
-        dataset: opens the dataset.
-
-    Returns:
-        False if M was there already.
-
-    Raises:
-        ValueError: a file in the folder is damaged or of another configuration or dataset.
-        OSError: another process works in the folder, or a file cannot be read or written.
-        FloatingPointError: the loss is not finite.
+    An interrupted training continues. `dataset` opens the dataset. Raises as `train_vae`.
     """
     path = Path(folder) / MDN_RNN_FILE
     if path.exists():
@@ -80,9 +61,9 @@ def train_mdn_rnn(config: Config, dataset: Callable[[], Dataset], folder: Path) 
 def check_mdn_rnn(config: Config, folder: Path) -> None:
     """Raise ValueError if M is damaged, or of another configuration or V."""
     path = Path(folder) / MDN_RNN_FILE
-    _, metadata = load_mdn_rnn(path)
+    _, metadata = weights.load_mdn_rnn(path)
     check_same(path, metadata, mdn_rnn_depends_on(config))
-    check_belongs(path, metadata, vae=load_vae(path.with_name(VAE_FILE))[1]["weights"])
+    weights.check_belongs(path, metadata, vae=load_vae(path.with_name(VAE_FILE))[1]["weights"])
 
 
 def mdn_rnn_depends_on(config: Config) -> dict:
@@ -96,7 +77,7 @@ def fit_mdn_rnn(config: Config, latents: Latents, path: Path, device: torch.devi
     mdn_rnn = MDNRNN(*sizes).to(device)
     training = mdn_rnn_training(config, latents, mdn_rnn, path.with_name(CHECKPOINT))
     history = fit(training)
-    save_mdn_rnn(path, mdn_rnn, config, history, latents.vae)
+    weights.save_mdn_rnn(path, mdn_rnn, config, history, latents.vae)
     training.checkpoint.unlink(missing_ok=True)
 
 
@@ -104,15 +85,15 @@ def mdn_rnn_training(
     config: Config, latents: Latents, mdn_rnn: MDNRNN, checkpoint: Path
 ) -> Training:
     """What `fit` needs to train M."""
-    length, device = config.mdn_rnn.sequence, next(mdn_rnn.parameters()).device
+    settings, device = config.mdn_rnn, next(mdn_rnn.parameters()).device
 
     def read(episodes: slice, count: int, rng: np.random.Generator) -> tuple:
         encoded, actions = latents.encoded[episodes], latents.actions[episodes]
-        return sequence_batch(encoded, actions, length, count, rng)
+        return sequence_batch(encoded, actions, settings.sequence, count, rng)
 
     def batch(step: int) -> tuple:
         rng = random_stream("mdn_rnn", config.seed, step)
-        return read(slice(latents.first_heldout), config.mdn_rnn.batch, rng)
+        return read(slice(latents.first_heldout), settings.batch, rng)
 
     def losses(z: torch.Tensor, actions: torch.Tensor) -> dict[str, torch.Tensor]:
         z = z.to(device)
@@ -124,16 +105,10 @@ def mdn_rnn_training(
         found = losses(*read(heldout, HELDOUT_SEQUENCES, random_stream("heldout", 0)))
         return {"total": found["total"].item()}
 
+    made_with = {**mdn_rnn_depends_on(config), "vae_weights": latents.vae}
+    schedule = settings.steps, settings.learning_rate
     return Training(
-        model=mdn_rnn,
-        batch=batch,
-        losses=losses,
-        heldout_losses=heldout_losses,
-        steps=config.mdn_rnn.steps,
-        learning_rate=config.mdn_rnn.learning_rate,
-        checkpoint=checkpoint,
-        made_with={**mdn_rnn_depends_on(config), "vae_weights": latents.vae},
-        label="train M",
+        mdn_rnn, batch, losses, heldout_losses, *schedule, checkpoint, made_with, label="train M"
     )
 
 
@@ -149,21 +124,11 @@ def encode_dataset(vae: VAE, dataset: Dataset, stride: int) -> list[np.ndarray]:
 
 
 def sequence_batch(
-    encoded: list[np.ndarray],
-    actions: list[np.ndarray],
-    length: int,
-    count: int,
-    rng: np.random.Generator,
+    encoded: list, actions: list, length: int, count: int, rng: np.random.Generator
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Random sequences of random episodes.
+    """Random sequences of random episodes: z (count, length + 1, z) and actions (count, length, 3).
 
     z is sampled from N(mu, exp(logvar)) each time, so that M cannot memorise one sample.
-
-    Returns:
-        z (count, length + 1, latent_size) and actions (count, length, 3).
-
-    Raises:
-        ValueError: no episode is longer than `length`.
     """
     long_enough = long_episodes([episode.shape[1] for episode in encoded], length)
     latents, chosen = [], []

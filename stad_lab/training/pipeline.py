@@ -13,6 +13,7 @@ The folder of a run::
 """
 
 import contextlib
+import functools
 import importlib.metadata
 import os
 import platform
@@ -20,23 +21,19 @@ import shlex
 import subprocess
 import threading
 import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
 
 import torch
 
-from stad_lab.agent import PRETRAINED, run_folder
+from stad_lab.agent import PRETRAINED
 from stad_lab.config import PRESETS, Config, check_same, fields_of
 from stad_lab.io.files import copy_file, load_json, load_tensors, locked, save_json, save_tensors
-from stad_lab.io.weights import (
-    CONTROLLER_FILE,
-    MDN_RNN_FILE,
-    VAE_FILE,
-    load_vae,
-    load_world_model,
-)
+from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_vae, load_world_model
 from stad_lab.io.workers import worker_threads
+from stad_lab.training import second_iteration
 from stad_lab.training.dataset import (
     MANIFEST,
     Dataset,
@@ -47,12 +44,6 @@ from stad_lab.training.dataset import (
 )
 from stad_lab.training.evolution import LOG, evolve, read_log
 from stad_lab.training.mdn_rnn import check_mdn_rnn, train_mdn_rnn
-from stad_lab.training.second_iteration import (
-    carry_over,
-    check_earlier_agent,
-    collect_again,
-    order_of_episodes,
-)
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE, find_components
 from stad_lab.training.trainer import training_device
 from stad_lab.training.vae import check_vae, train_vae
@@ -81,7 +72,9 @@ def train(
     executor: Executor | None = None,
     earlier: str | Path | None = None,
 ) -> bool:
-    """Run every stage up to `until` that is not finished in `folder`; call it again to continue.
+    """Run every stage up to `until` that is not finished in `folder`; False if all were.
+
+    After an interruption the same call continues.
 
     Args:
         folder: of the run; made if missing.
@@ -90,9 +83,6 @@ def train(
         executor: who drives; None for `config.processes` threads of this machine.
         earlier: in a second iteration, the folder of the run whose agent drives
             `data.agent_episodes` for the dataset, and whose C is carried over.
-
-    Returns:
-        False if everything was finished already.
 
     Raises:
         ValueError: a wrong argument, or a file in the folder that is damaged or of another run.
@@ -110,31 +100,26 @@ def train(
     data = folder / "dataset" if dataset_folder is None else Path(dataset_folder)
     before = None
     if earlier is not None:
-        before = read_finished(Path(earlier))
-        check_earlier_agent(config, Path(earlier))
+        earlier = Path(earlier)
+        before = read_finished(earlier)
+        second_iteration.check_earlier_agent(config, earlier)
     check_stages(config, folder, data)
-    stages = make_stages(config, folder, data, None if earlier is None else Path(earlier))
+    stages = make_stages(config, folder, data, earlier)
     wanted = {name: stages[name] for name in STAGES[: STAGES.index(until) + 1]}
     return run_stages(wanted, config, folder, data, executor, before)
 
 
 def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) -> dict[str, Stage]:
     """The four stages as functions of the executor that drives."""
-    opened = []
-
-    def dataset() -> Dataset:
-        """The dataset, which is read and checked once for all stages."""
-        if not opened:
-            opened.append(Dataset(data))
-        return opened[0]
+    dataset = functools.cache(lambda: Dataset(data))  # read and checked once for all stages
 
     def collect_stage(pool: Executor) -> bool:
-        return (
-            collect_again(config, earlier, data, pool) if earlier else collect(config, data, pool)
-        )
+        if earlier:
+            return second_iteration.collect_again(config, earlier, data, pool)
+        return collect(config, data, pool)
 
     def controller_stage(pool: Executor) -> bool:
-        did = earlier is not None and carry_over(config, earlier, dataset, folder)
+        did = bool(earlier) and second_iteration.carry_over(config, earlier, dataset, folder)
         did |= find_components(config, dataset, folder)
         return did | evolve(config, folder, pool)
 
@@ -165,10 +150,8 @@ def check_record(folder: Path) -> None:
     path = folder / RECORD
     record = load_json(path) if path.exists() else {"config": {}}
     if "settings" in record:
-        raise ValueError(
-            f"{folder} holds a run of stad_lab 0.1: continue it with that version, or choose"
-            " another folder"
-        )
+        remedy = "continue it with that version, or choose another folder"
+        raise ValueError(f"{folder} holds a run of stad_lab 0.1: {remedy}")
     if "config" not in record:
         raise ValueError(f"{path} is of {record.get('variant')!r}, no run: choose another folder")
 
@@ -245,9 +228,8 @@ def open_record(config: Config, folder: Path, before: dict | None, command: str)
         return {**new, "made_with": made, "seconds": {}, **earlier}
     record = load_json(path, kind="record")
     if (folder / VAE_FILE).exists():  # then its part of the configuration has not changed
-        check_same(
-            path, record["config"], {n: new["config"][n] for n in ("variant", "seed", "vae")}
-        )
+        fixed = {name: new["config"][name] for name in ("variant", "seed", "vae")}
+        check_same(path, record["config"], fixed)
     record |= new
     if made != starts(record)[-1]:
         record["continued_with"] = [*starts(record)[1:], made]
@@ -262,32 +244,29 @@ def starts(record: dict) -> list[dict]:
 def read_finished(earlier: Path) -> dict:
     """The record of a run whose CMA-ES has finished.
 
-    Raises:
-        ValueError: it has not, or a file is damaged.
-        FileNotFoundError: there is no run, or no log.
+    ValueError if it has not, or a file is damaged; FileNotFoundError if there is no run, or no log.
     """
     check_record(earlier)
     record = load_json(earlier / RECORD, GIVE_A_RUN)
     log = load_json(earlier / LOG, GIVE_A_RUN)
     done, asked = len(log["generations"]), log["evolution"]["generations"]
     if done != asked:
-        raise ValueError(
-            f"CMA-ES in {earlier} is not finished, with {done} of {asked} generations: run its own"
-            " command to the end first"
-        )
+        found = f"with {done} of {asked} generations: run its own command to the end first"
+        raise ValueError(f"CMA-ES in {earlier} is not finished, {found}")
     return record
 
 
 def command_of(config: Config) -> str:
     """The command line that makes a run of this configuration."""
-    changed = {
-        name: changes(config, Config.preset(name, variant=config.variant)) for name in PRESETS
-    }
-    name = min(changed, key=lambda name: len(changed[name]))
-    options = [option_of(*change) for change in changed[name].items()]
-    command = f"python -m stad_lab train {name} --variant {config.variant} --out ..."
+    options = {}
+    for preset in PRESETS:
+        usual = fields_of(Config.preset(preset, variant=config.variant))
+        pairs = zip(fields_of(config), usual, strict=True)
+        options[preset] = [option_of(ours[0], ours[2]) for ours, other in pairs if ours != other]
+    preset = min(options, key=lambda preset: len(options[preset]))
+    command = f"python -m stad_lab train {preset} --variant {config.variant} --out ..."
     earlier = ["--earlier ..."] if config.data.agent_episodes else []
-    return " ".join([command, *options, *earlier])
+    return " ".join([command, *options[preset], *earlier])
 
 
 def fine_tuning_command(config: Config) -> str:
@@ -295,12 +274,6 @@ def fine_tuning_command(config: Config) -> str:
     names = ("generations", "sigma", "seed")
     options = [option_of(name, getattr(config.evolution, name)) for name in names]
     return " ".join(["python -m stad_lab fine-tune --run ... --out ...", *options])
-
-
-def changes(config: Config, usual: Config) -> dict:
-    """Dotted names and values of the fields that differ from `usual`."""
-    before = {name: value for name, _, value in fields_of(usual)}
-    return {name: value for name, _, value in fields_of(config) if value != before[name]}
 
 
 def option_of(name: str, value: object) -> str:
@@ -345,12 +318,8 @@ def git(*arguments: str) -> str | None:
     try:
         # An environment may lie in the checkout of something else, which does not track this file.
         for command in (["ls-files", "--error-unmatch", here.name], arguments):
-            found = subprocess.run(
-                ["git", "-C", str(here.parent), *command],
-                capture_output=True,
-                text=True,
-                check=True,
-            )
+            whole = ["git", "-C", str(here.parent), *command]
+            found = subprocess.run(whole, capture_output=True, text=True, check=True)
         return found.stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return None
@@ -361,28 +330,23 @@ def budget(config: Config, folder: Path, data: Path | None) -> dict:
 
     Those of an earlier run are in its own record; `total_budget` adds them.
     """
-    spent = {"random": {"episodes": 0, "frames": 0}}
+    spent = defaultdict(Counter, random=Counter(episodes=0, frames=0))
     count = config.data.episodes
-    order = order_of_episodes(config) if config.data.agent_episodes else range(count)
+    again = config.data.agent_episodes > 0
+    order = second_iteration.order_of_episodes(config) if again else range(count)
     for entry in load_json(data / MANIFEST)["episodes"] if data else ():
         driver = "random" if order[entry["index"]] < count else "agent_driver"
-        add(spent, driver, 1, entry["frames"])
+        spent[driver].update(episodes=1, frames=entry["frames"])
     if (folder / LOG).exists():
         generations = load_json(folder / LOG)["generations"]
         spent["agents"] = sum(len(entry["returns"]) for entry in generations)
         for entry in generations:
-            add(spent, "evolution", sum(map(len, entry["returns"])), entry["frames"])
-            if "validation" in entry:
-                validation = entry["validation"]
-                add(spent, "validation", len(validation["returns"]), validation["frames"])
-    return spent
-
-
-def add(spent: dict, purpose: str, episodes: int, frames: int) -> None:
-    """Add episodes and frames to those of a purpose."""
-    one = spent.setdefault(purpose, {"episodes": 0, "frames": 0})
-    one["episodes"] += episodes
-    one["frames"] += frames
+            episodes = sum(map(len, entry["returns"]))
+            spent["evolution"].update(episodes=episodes, frames=entry["frames"])
+            if validation := entry.get("validation"):
+                episodes = len(validation["returns"])
+                spent["validation"].update(episodes=episodes, frames=validation["frames"])
+    return dict(spent)
 
 
 def total_budget(record: dict) -> dict[str, int]:
@@ -407,11 +371,8 @@ def ship(folder: str | Path, name: str) -> Path:
     """Copy a run into `stad_lab/pretrained/NAME`: V, M and C in half precision, and its record.
 
     Evaluate the shipped agent after this, not the run. Returns the new folder; what an agent of
-    that name left there is removed.
-
-    Raises:
-        FileNotFoundError: the run has no V.
-        ValueError: the run is damaged, or is the shipped agent itself.
+    that name left there is removed. FileNotFoundError if the run has no V; ValueError if it is
+    damaged, or is the shipped agent itself.
     """
     folder, target = Path(folder), PRETRAINED / name
     load_vae(folder / VAE_FILE)
@@ -420,15 +381,12 @@ def ship(folder: str | Path, name: str) -> Path:
     shipped = [one for one in (*WEIGHTS, RECORD, LOG) if (folder / one).exists()]
     read = {one: load_tensors(folder / one) for one in shipped if one in WEIGHTS}  # all, then write
     for one, (tensors, metadata) in read.items():
-        small = {
-            key: value.half() if value.dtype == torch.float32 else value
-            for key, value in tensors.items()
-        }
-        save_tensors(target / one, small, **metadata)
-    for one in shipped:
-        if one not in read:
-            copy_file(folder / one, target)
-    for file in run_folder(target).glob("*.*"):
+        for key, value in tensors.items():
+            tensors[key] = value.half() if value.dtype == torch.float32 else value
+        save_tensors(target / one, tensors, **metadata)
+    for one in sorted(set(shipped) - read.keys()):
+        copy_file(folder / one, target)
+    for file in target.glob("*.*"):
         if file.is_file() and file.name not in shipped and file.suffix != ".md":
             file.unlink()
     return target

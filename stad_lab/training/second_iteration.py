@@ -1,11 +1,10 @@
 """A second iteration of the world model: V and M learn from what the first agent sees.
 
 The random driver soon leaves the road, so the first V and M have hardly seen the road at speed,
-which is nearly all that their agent sees. In a second iteration that agent drives for the dataset,
-beside the random driver, and V and M are retrained on both. The new V has other latents, on which
-the old C is useless. But the old C's outputs on the recorded episodes are known, so a ridge
-regression finds the C with the same outputs on the new z and h, and evolution starts there. This
-costs no episode. (World Models, section 5, proposes such iterations for harder tasks.)
+which is nearly all that their agent sees. In a second iteration that agent drives for the dataset
+too, and V and M are retrained. The new V has other latents, on which the old C is useless, so a
+ridge regression finds the C whose outputs on the new z and h are those of the old C on the recorded
+episodes, and evolution starts there. (World Models, section 5, proposes such iterations.)
 """
 
 from collections.abc import Callable
@@ -18,12 +17,7 @@ from stad_lab.agent import Agent, features_of, load_agent
 from stad_lab.config import Config, random_stream, track_seeds
 from stad_lab.envs.cars import Cars
 from stad_lab.io.files import checksum_of_arrays
-from stad_lab.io.weights import (
-    CONTROLLER_FILE,
-    WorldModel,
-    load_controller,
-    load_world_model,
-)
+from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_controller, load_world_model
 from stad_lab.io.workers import single_thread, worker_threads
 from stad_lab.models.controller import seen_columns, unpack
 from stad_lab.training.dataset import (
@@ -46,23 +40,16 @@ PENALTY = 0.01  # of the ridge regression, for each frame
 def collect_again(
     config: Config, earlier: Path, folder: Path, executor: Executor | None = None
 ) -> bool:
-    """Collect a dataset of both drivers into `folder`, or what is missing of it.
+    """Collect a dataset of the random driver and of the agent of the run in `earlier`.
 
     The random driver's episodes are those of a first iteration with the same configuration; the
-    agent's are mixed among them.
-
-    Args:
-        earlier: folder of the first run, whose agent drives.
-        executor: who drives; None for `config.processes` threads of this machine.
-
-    Returns and raises as `training.dataset.collect`.
+    agent's are mixed among them. Executor, result and errors are those of `collect`.
     """
     parameters, _ = load_controller(earlier / CONTROLLER_FILE)
     agent = {"variant": config.variant, "controller": checksum_of_arrays(parameters=parameters)}
     order, data = order_of_episodes(config), config.data
-    longest = [
-        data.episode_frames if number < data.episodes else data.agent_frames for number in order
-    ]
+    limits = data.episode_frames, data.agent_frames
+    longest = [limits[number >= data.episodes] for number in order]
     with worker_threads(config.processes, executor) as executor:
         source = hand_out(executor, earlier)
         tasks = [(source, parameters, config, number) for number in order]
@@ -73,15 +60,16 @@ def collect_again(
 def check_earlier_agent(config: Config, earlier: Path) -> None:
     """Raise ValueError unless the earlier agent is of this variant and sees the same frames."""
     world_model = load_agent(Path(earlier)).world_model
-    if world_model.vae.variant != config.variant:
+    variant, crop_bar = world_model.vae.variant, world_model.crop_bar
+    if variant != config.variant:
         raise ValueError(
-            f"variant={config.variant!r}, but the run in {earlier} is of"
-            f" {world_model.vae.variant!r}: give a run of the same variant"
+            f"variant={config.variant!r}, but the run in {earlier} is of {variant!r}: give a run of"
+            " the same variant"
         )
-    if world_model.crop_bar != config.data.crop_bar:
+    if crop_bar != config.data.crop_bar:
         raise ValueError(
-            f"data.crop_bar={config.data.crop_bar}, but the run in {earlier} has"
-            f" {world_model.crop_bar}: set the same, or train a first iteration with it"
+            f"data.crop_bar={config.data.crop_bar}, but the run in {earlier} has {crop_bar}: set"
+            " the same, or train a first iteration with it"
         )
 
 
@@ -106,9 +94,9 @@ def drive_either(
 
 
 class NoisyDriver:
-    """An agent whose steering and gas are disturbed, so that it meets many situations.
+    """An agent whose steering and gas are disturbed, in each episode by another strength of noise.
 
-    The strength of the noise differs from episode to episode. M is told what was done.
+    So it meets many situations. M receives the disturbed actions.
     """
 
     def __init__(self, agent: Agent, rng: np.random.Generator):
@@ -143,13 +131,9 @@ def drive_noisily(agent: Agent, config: Config, index: int) -> Episode:
 
 
 def carry_over(config: Config, earlier: Path, dataset: Callable[[], Dataset], folder: Path) -> bool:
-    """Find the C that acts on the new V and M, in `folder`, as the earlier C does on its own.
+    """Fit the C that acts on the new V and M, in `folder`, as the earlier one; writes START_FILE.
 
-    Returns:
-        False if START_FILE was there already.
-
-    Raises:
-        ValueError, FileNotFoundError: a file of one of the runs is damaged or missing.
+    False if it was there already. ValueError or FileNotFoundError if a file is damaged or missing.
     """
     path, new = Path(folder) / START_FILE, load_world_model(Path(folder))
     if path.exists():

@@ -1,9 +1,9 @@
 """Where CMA-ES searches for C: along all of its weights, or along a few directions.
 
-C sees z and h, 288 numbers, and has three weights for each. But these numbers move together: a few
-dozen principal components hold nearly all of their variance. With `evolution.components`, CMA-ES
-searches for the weights of the leading components alone. They are fitted to the dataset and cost no
-episode. A C that is linear in them is linear in z and h, so the result is an ordinary C.
+C sees z and h, 288 numbers, and has three weights for each. But a few dozen principal components
+hold nearly all of their variance. With `evolution.components`, CMA-ES searches for the weights of
+the leading components alone, which are fitted to the dataset. A C that is linear in them is linear
+in z and h, so the result is an ordinary C.
 """
 
 from collections.abc import Callable, Iterable
@@ -18,13 +18,8 @@ from stad_lab.agent import features_of
 from stad_lab.config import Config
 from stad_lab.io.files import save_tensors
 from stad_lab.io.weights import WorldModel, check_belongs, load_kind, load_world_model
-from stad_lab.models.controller import (
-    ACTION_SIZE,
-    check_parameters,
-    initial_parameters,
-    parameter_count,
-    seen_columns,
-)
+from stad_lab.models import controller
+from stad_lab.models.controller import ACTION_SIZE, seen_columns
 from stad_lab.training.dataset import Dataset
 
 START_FILE = "start.safetensors"
@@ -35,12 +30,9 @@ COMPONENTS_FILE = "components.safetensors"
 class SearchSpace:
     """All controllers that CMA-ES can find: an origin, and the effect of a step along each axis."""
 
-    first: np.ndarray
-    """Where CMA-ES begins, float64 (dimensions,)."""
-    origin: np.ndarray
-    """The controller at zero, float64 (parameters,)."""
-    directions: np.ndarray
-    """float64 (dimensions, parameters)."""
+    first: np.ndarray  # where CMA-ES begins, float64 (dimensions,)
+    origin: np.ndarray  # the controller at zero, float64 (parameters,)
+    directions: np.ndarray  # float64 (dimensions, parameters)
 
     def expand(self, points: np.ndarray) -> np.ndarray:
         """The parameters of C (..., parameters) for points of the search (..., dimensions)."""
@@ -50,11 +42,9 @@ class SearchSpace:
 def search_space(config: Config, world_model: WorldModel, folder: Path) -> SearchSpace:
     """Where the CMA-ES run in `folder` searches, and from which C.
 
-    Raises:
-        ValueError, FileNotFoundError: the file of the first C or of the components is damaged,
-            missing, or for another V and M.
+    ValueError or FileNotFoundError if START_FILE or COMPONENTS_FILE does not fit or is missing.
     """
-    start = initial_parameters(*world_model.sizes, config.evolution.initial_gas)
+    start = controller.initial_parameters(*world_model.sizes, config.evolution.initial_gas)
     if config.data.agent_episodes or (folder / START_FILE).exists():
         start = load_start(folder / START_FILE, world_model)
     if config.evolution.components:
@@ -76,49 +66,42 @@ def load_start(path: Path, world_model: WorldModel) -> np.ndarray:
     tensors, metadata = load_kind(path, "start", "vae", "mdn_rnn")
     check_belongs(path, metadata, **world_model.checksums)
     parameters = tensors["parameters"].numpy()
-    check_parameters(parameters, parameter_count(*world_model.sizes), path)
+    count = controller.parameter_count(*world_model.sizes)
+    controller.check_parameters(parameters, count, path)
     return parameters
 
 
 def find_components(config: Config, dataset: Callable[[], Dataset], folder: Path) -> bool:
     """Fit the principal components of what C sees in the dataset; writes COMPONENTS_FILE.
 
-    Args:
-        dataset: opens the dataset.
-
-    Returns:
-        False if they were there already, or `evolution.components` is 0.
-
-    Raises:
-        ValueError, FileNotFoundError: V, M or the components are damaged, missing or of another
-            run.
+    False if they were there already, or `evolution.components` is 0. `dataset` opens the dataset.
+    Raises as `search_space`.
     """
     count = config.evolution.components
     if not count:
         return False
     path, world_model = Path(folder) / COMPONENTS_FILE, load_world_model(Path(folder))
-    if path.exists() and fits(config, path, world_model):
-        return False
+    depends_on = {"count": count, "features": config.evolution.features}
+    if path.exists():
+        load_directions(path, world_model)  # raises if they are of another world model
+        was = depends_on | load_kind(path, "components")[1]
+        if all(was[name] == value for name, value in depends_on.items()):
+            return False
     data = dataset()
     episodes = zip(tqdm(data.frames, "components", unit="episode"), data.actions, strict=True)
     seen = (features_of(world_model, *episode) for episode in episodes)
     columns = seen_columns(config.evolution.features, *world_model.sizes)
     middle, components = principal_components(seen, columns, count)
     tensors = {"middle": torch.from_numpy(middle), "components": torch.from_numpy(components)}
-    metadata = {"kind": "components", "variant": config.variant, **components_of(config)}
+    metadata = {"kind": "components", "variant": config.variant, **depends_on}
     save_tensors(path, tensors, **metadata, **world_model.checksums)
     return True
-
-
-def components_of(config: Config) -> dict:
-    """The configuration that the components depend on, beside V, M and the dataset."""
-    return {"count": config.evolution.components, "features": config.evolution.features}
 
 
 def principal_components(
     seen: Iterable[np.ndarray], columns: np.ndarray, count: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of the features, and the directions of their largest variance.
+    """The mean of the features, and the directions of their largest variance, of length 1.
 
     They are not scaled to equal variance: a direction in which little happens is of little use to
     C, and equal steps along all of them leave it little weight.
@@ -129,7 +112,7 @@ def principal_components(
         count: of components, at most.
 
     Returns:
-        float64 (features,), and (components, features) of length 1, by decreasing variance.
+        float64 (features,) and (components, features).
     """
     frames, total, squares = 0, np.zeros(len(columns)), np.zeros((len(columns), len(columns)))
     for episode in seen:
@@ -144,21 +127,11 @@ def principal_components(
     return middle, components
 
 
-def fits(config: Config, path: Path, world_model: WorldModel) -> bool:
-    """Whether the components are those of this configuration. Raises as `search_space`."""
-    load_directions(path, world_model)
-    metadata = load_kind(path, "components")[1]
-    return all(metadata.get(name, value) == value for name, value in components_of(config).items())
-
-
 def load_directions(path: Path, world_model: WorldModel) -> np.ndarray:
-    """The effect of a step along each component, and along the three biases, on C's parameters.
+    """What a step along each component and each bias adds to C, float64 (dimensions, parameters).
 
     The output along a component is its weight times the distance from the mean, so the bias
     subtracts the mean. Raises as `search_space`.
-
-    Returns:
-        float64 (dimensions, parameters).
     """
     tensors, metadata = load_kind(path, "components", "vae", "mdn_rnn")
     check_belongs(path, metadata, **world_model.checksums)

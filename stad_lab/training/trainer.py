@@ -1,19 +1,22 @@
 """One training loop for V and for M: Adam, a falling learning rate, checkpoints and a history.
 
-What happens in step s depends on the seed, s and the weights alone: the caller draws the batch of
-step s from a Generator of its own. So a run that was interrupted and resumed makes the same updates
-as one that was not: bit for bit on the CPU with as many threads, and nearly so on a GPU.
+Step s depends on the seed, s and the weights alone, because its batch is drawn from a Generator of
+its own. So a resumed training makes the same updates as one that was not interrupted: bit-identical
+on the CPU with as many threads, and nearly so on a GPU.
 """
 
 import contextlib
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import nn
+from torch.optim import Adam
 from tqdm.auto import tqdm
 
 from stad_lab.config import check_same, random_stream
@@ -28,30 +31,23 @@ LAST_RATE = 0.1  # learning rate at the end, as a share of that at the start
 class Training:
     """What is trained, on what, and where its state is kept."""
 
-    model: torch.nn.Module
-    batch: Callable[[int], tuple]
-    """step -> the arguments of `losses`."""
-    losses: Callable[..., dict[str, torch.Tensor]]
-    """The batch -> its named losses; "total" is minimised."""
-    heldout_losses: Callable[[], dict[str, float]]
-    """Named losses on held-out data."""
+    model: nn.Module
+    batch: Callable[[int], tuple]  # step -> the arguments of `losses`
+    losses: Callable[..., dict[str, torch.Tensor]]  # by name; "total" is minimised
+    heldout_losses: Callable[[], dict[str, float]]  # by the same names
     steps: int
     learning_rate: float
     checkpoint: Path
-    """File of the training's state."""
-    made_with: dict
-    """Configuration and checksums of all that the training depends on."""
-    label: str
-    """What the progress bar says."""
+    made_with: dict  # configuration and checksums of all that the training depends on
+    label: str  # of the progress bar
+    # Called with the history after every entry, and when a training is resumed.
     watch: Callable[[list[dict]], None] | None = None
-    """Called with the history after every entry, and when a training is resumed."""
 
 
 def fit(training: Training) -> list[dict]:
-    """Train the model in place, or continue from the checkpoint.
+    """Train the model in place, or continue from the checkpoint; returns the history.
 
-    Returns:
-        The history: entries {"step", "train": mean losses since the last entry, "heldout"}.
+    Its entries are {"step", "train": mean losses since the last entry, "heldout"}.
 
     Raises:
         ValueError: the checkpoint belongs to another training or is damaged.
@@ -59,10 +55,10 @@ def fit(training: Training) -> list[dict]:
         OSError: the checkpoint cannot be written; the one before it is whole.
     """
     # fused: one pass over the weights instead of ten
-    optimizer = torch.optim.Adam(training.model.parameters(), lr=0.0, fused=True)
+    optimizer = Adam(training.model.parameters(), lr=0.0, fused=True)
     history = load_state(training, optimizer) if training.checkpoint.exists() else []
     start, steps = history[-1]["step"] if history else 0, training.steps
-    every, sums, step = max(1, steps // ENTRIES), {}, start
+    every, sums, step = max(1, steps // ENTRIES), Counter(), start
     if training.watch and history:
         training.watch(history)
     batches = read_ahead(training.batch, range(start, steps))
@@ -72,18 +68,16 @@ def fit(training: Training) -> list[dict]:
             losses = training.losses(*present)
             check_finite(losses["total"].item(), training.label, step)
             update(training.model, optimizer, losses["total"], learning_rate(training, step))
-            for name, loss in losses.items():
-                sums[name] = sums.get(name, 0.0) + loss.item()
+            sums.update({name: loss.item() for name, loss in losses.items()})
             if (step + 1) % every == 0 or step + 1 == steps:
                 history.append(entry(training, step, history, sums))
-                sums = {}
+                sums.clear()
                 progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
                 save_state(training, optimizer, history)
                 if training.watch:
                     training.watch(history)
     except KeyboardInterrupt:
-        print(f"{training.label}: interrupted in step {step}; the same call continues from the last"
-              " checkpoint")  # fmt: skip
+        print(f"{training.label}: interrupted in step {step}; the same call continues")
         raise
     return history
 
@@ -104,24 +98,21 @@ def learning_rate(training: Training, step: int) -> float:
     return training.learning_rate * (LAST_RATE + (1 - LAST_RATE) * falling)
 
 
-def update(
-    model: torch.nn.Module, optimizer: torch.optim.Optimizer, total: torch.Tensor, rate: float
-) -> None:
+def update(model: nn.Module, optimizer: Adam, total: torch.Tensor, rate: float) -> None:
     """One step of Adam against the gradient of `total`."""
     for group in optimizer.param_groups:
         group["lr"] = rate
     optimizer.zero_grad(set_to_none=True)
     total.backward()
-    torch.nn.utils.clip_grad_norm_(model.parameters(), LARGEST_NORM)
+    nn.utils.clip_grad_norm_(model.parameters(), LARGEST_NORM)
     optimizer.step()
 
 
 def check_finite(total: float, label: str, step: int) -> None:
     """Raise FloatingPointError unless a loss is finite."""
     if not math.isfinite(total):
-        raise FloatingPointError(
-            f"{label}: the loss is {total} in step {step}: lower the learning rate, in a new folder"
-        )
+        remedy = "lower the learning rate, in a new folder"
+        raise FloatingPointError(f"{label}: the loss is {total} in step {step}: {remedy}")
 
 
 def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[int, tuple]]:
@@ -151,10 +142,7 @@ def torch_settings(seed: int, number: int) -> Iterator[torch.device]:
 
 
 def training_device() -> torch.device:
-    """A CUDA GPU if there is one that computes, unless CUDA_VISIBLE_DEVICES hides it; or the CPU.
-
-    Agents always drive on the CPU.
-    """
+    """A CUDA GPU if one computes and CUDA_VISIBLE_DEVICES does not hide it; otherwise the CPU."""
     if torch.cuda.is_available():
         try:
             torch.ones(1, device="cuda").add_(1).item()
@@ -164,7 +152,7 @@ def training_device() -> torch.device:
     return torch.device("cpu")
 
 
-def save_state(training: Training, optimizer: torch.optim.Optimizer, history: list) -> None:
+def save_state(training: Training, optimizer: Adam, history: list) -> None:
     """Write everything the next step depends on: weights, Adam's moments and the history."""
     tensors = {f"model.{name}": value for name, value in training.model.state_dict().items()}
     for number, moments in optimizer.state_dict()["state"].items():
@@ -173,7 +161,7 @@ def save_state(training: Training, optimizer: torch.optim.Optimizer, history: li
     save_tensors(training.checkpoint, tensors, **metadata)
 
 
-def load_state(training: Training, optimizer: torch.optim.Optimizer) -> list[dict]:
+def load_state(training: Training, optimizer: Adam) -> list[dict]:
     """Restore what `save_state` wrote into the model and the optimizer; returns the history."""
     path = training.checkpoint
     tensors, metadata = load_tensors(path, "run the same command again to train from the start")

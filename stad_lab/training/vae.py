@@ -25,14 +25,11 @@ def train_vae(
     folder: Path,
     watch: Callable[[list[dict]], None] | None = None,
 ) -> bool:
-    """Train V on the dataset and write it into `folder`; an interrupted training continues.
+    """Train V into `folder`, or continue an interrupted training; False if V was there already.
 
     Args:
         dataset: opens the dataset.
         watch: called with the training's history as it grows.
-
-    Returns:
-        False if V was there already.
 
     Raises:
         ValueError: a file in the folder is damaged or of another configuration or dataset.
@@ -84,9 +81,8 @@ def vae_training(config: Config, dataset: Dataset, vae: VAE, checkpoint: Path) -
     training, heldout = dataset.split()
     count = min(HELDOUT_FRAMES, len(heldout))
     heldout = heldout[np.linspace(0, len(heldout) - 1, count).astype(int)]
-    weights = {
-        name: getattr(config.vae, name) for name in ("kl_weight", "free_bits", "difference_weight")
-    }
+    names = ("kl_weight", "free_bits", "difference_weight")
+    weights = {name: getattr(config.vae, name) for name in names}
 
     def read(indices: np.ndarray, rng: np.random.Generator) -> tuple:
         noise = rng.standard_normal((len(indices), config.vae.latent_size), np.float32)
@@ -105,20 +101,9 @@ def vae_training(config: Config, dataset: Dataset, vae: VAE, checkpoint: Path) -
         rngs = [random_stream("heldout", 0, number) for number in range(len(parts))]
         found = [losses(*read(part, rng)) for part, rng in zip(parts, rngs, strict=True)]
         sizes = [len(part) for part in parts]
-        return {
-            name: float(np.average([one[name].item() for one in found], weights=sizes))
-            for name in found[0]
-        }
+        values = {name: [one[name].item() for one in found] for name in found[0]}
+        return {name: float(np.average(own, weights=sizes)) for name, own in values.items()}
 
     made_with = {**vae_depends_on(config), "dataset": dataset.checksum}
-    return Training(
-        model=vae,
-        batch=batch,
-        losses=losses,
-        heldout_losses=heldout_losses,
-        steps=config.vae.steps,
-        learning_rate=config.vae.learning_rate,
-        checkpoint=checkpoint,
-        made_with=made_with,
-        label=f"train V ({config.variant})",
-    )
+    label, schedule = f"train V ({config.variant})", (config.vae.steps, config.vae.learning_rate)
+    return Training(vae, batch, losses, heldout_losses, *schedule, checkpoint, made_with, label)
