@@ -21,34 +21,22 @@ PRESET_VARIABLE = "STAD_LAB_PRESET"
 VARIANTS = ("frame", "input", "output", "input_output")
 SMALLEST_SIGMA = 1e-12  # near 0 CMA-ES cannot compute
 
-# (lowest, highest) value of a field; an int or float that is not listed is at least 1, or above 0.
-RANGES = {
-    "seed": (0, 2**63),
-    "processes": (1, 10_000),
-    "data.episodes": (2, 1_000_000),  # one to train on, one held out
-    "data.episode_frames": (1, 1000),  # CarRacing ends an episode then
-    "data.random_starts": (0, 1),
-    "data.agent_episodes": (0, 1_000_000),
-    "data.agent_frames": (1, 1000),
-    "data.agent_patience": (0, 1e12),
-    "vae.latent_size": (1, 10_000),
-    "vae.width": (1, 1000),
-    "vae.kl_weight": (0, 1e12),
-    "vae.free_bits": (0, 1e12),
-    "vae.difference_weight": (0, 1e12),
-    "mdn_rnn.hidden_size": (1, 10_000),
-    "mdn_rnn.mixtures": (1, 1000),
-    "mdn_rnn.steps": (0, 1e12),
-    "evolution.seed": (0, 2**63),
-    "evolution.population": (4, 100_000),
-    "evolution.replay_share": (0, 1),
-    "evolution.sigma_decay": (0, 1),
-    "evolution.components": (0, 1e12),
-    "evolution.initial_gas": (-100, 1e12),
-    "evolution.patience": (0, 1e12),
-    "evolution.max_frames": (1, 1000),
-    "evolution.averaged_share": (0, 1),
+# (lowest, highest) value of fields; any other int is at least 1, any other float above 0.
+BOUNDS = {
+    (0, 1): "data.random_starts evolution.averaged_share evolution.replay_share"
+    " evolution.sigma_decay",
+    (0, 1e12): "data.agent_patience evolution.components evolution.patience mdn_rnn.steps"
+    " vae.difference_weight vae.free_bits vae.kl_weight",
+    (-100, 1e12): "evolution.initial_gas",
+    (0, 1_000_000): "data.agent_episodes",
+    (0, 2**63): "seed evolution.seed",
+    (1, 1000): "data.agent_frames data.episode_frames evolution.max_frames mdn_rnn.mixtures"
+    " vae.width",  # CarRacing ends an episode after 1,000 frames
+    (1, 10_000): "mdn_rnn.hidden_size processes vae.latent_size",
+    (2, 1_000_000): "data.episodes",  # one to train on, one held out
+    (4, 100_000): "evolution.population",
 }
+RANGES = {name: bounds for bounds, names in BOUNDS.items() for name in names.split()}
 
 
 @dataclass(frozen=True)
@@ -179,15 +167,12 @@ class Config:
 
     @staticmethod
     def preset(name: str | None = None, /, **changes) -> "Config":
-        """Look up a preset and change some fields.
+        """Look up a preset and change some fields, as `replace` does.
 
         Args:
             name: "quick", "laptop" or "paper"; None reads the environment variable STAD_LAB_PRESET,
                 and takes "laptop" if that is not set.
             **changes: as for `replace`.
-
-        Raises:
-            ValueError: an unknown preset or field, or a value out of range.
         """
         name = name or os.environ.get(PRESET_VARIABLE) or "laptop"
         if name not in PRESETS:
@@ -196,7 +181,7 @@ class Config:
 
     def replace(self, **changes) -> "Config":
         """A copy with other values, for example `replace(seed=1, vae={"stride": 2})`."""
-        return from_dict(Config, changes, self)
+        return replace(self, changes)
 
     def as_dict(self) -> dict:
         """All fields as nested dicts, for JSON."""
@@ -205,22 +190,18 @@ class Config:
     @staticmethod
     def from_dict(values: dict) -> "Config":
         """The inverse of `as_dict`; a missing field has its default, an unknown one is refused."""
-        return from_dict(Config, values, Config())
+        return replace(Config(), values)
 
 
-def from_dict(kind: type, values: dict, base: Any) -> Any:
+def replace(base: Any, values: dict) -> Any:
     """A copy of the dataclass `base` with the values of a nested dict."""
-    known = {one.name: one.type for one in dataclasses.fields(kind)}
-    for name in values:
+    known, changed = [one.name for one in dataclasses.fields(base)], {}
+    for name, value in values.items():
         if name not in known:
             raise ValueError(f"unknown setting {name!r}: expected one of {', '.join(known)}")
-    nested = {
-        name: from_dict(known[name], value, getattr(base, name))
-        if isinstance(value, dict)
-        else value
-        for name, value in values.items()
-    }
-    return dataclasses.replace(base, **nested)
+        stage = getattr(base, name)
+        changed[name] = replace(stage, value) if isinstance(value, dict) else value
+    return dataclasses.replace(base, **changed)
 
 
 def fields_of(config: Config) -> list[tuple[str, Any, Any]]:
@@ -232,13 +213,10 @@ def fields_of(config: Config) -> list[tuple[str, Any, Any]]:
             found.append((one.name, one.type, value))
             continue
         if not isinstance(value, one.type):
-            raise ValueError(
-                f"{one.name}={value!r}: expected a {one.type.__name__} or a dict of it"
-            )
-        found += [
-            (f"{one.name}.{part.name}", part.type, getattr(value, part.name))
-            for part in dataclasses.fields(one.type)
-        ]
+            expected = f"a {one.type.__name__} or a dict of it"
+            raise ValueError(f"{one.name}={value!r}: expected {expected}")
+        for part in dataclasses.fields(value):
+            found.append((f"{one.name}.{part.name}", part.type, getattr(value, part.name)))
     return found
 
 
@@ -278,8 +256,7 @@ def check_together(config: Config) -> None:
     if evolution.sigma_decay and last_sigma < SMALLEST_SIGMA:
         raise ValueError(
             f"evolution.sigma_decay={evolution.sigma_decay} shrinks sigma={evolution.sigma} below"
-            f" {SMALLEST_SIGMA} in {evolution.generations} generations: use a factor nearer to 1,"
-            " or 0 for CMA-ES's own step size"
+            f" {SMALLEST_SIGMA} in {evolution.generations} generations: use one nearer to 1, or 0"
         )
 
 
@@ -309,10 +286,9 @@ def flatten(values: dict, prefix: str = "") -> dict:
 
 # The purposes that random numbers are drawn for. Each has its own stream; append, never reorder.
 STREAMS = (
-    "tracks", "random driver", "agent driver", "order", "init", "vae", "mdn_rnn", "evolution",
-    "heldout",
-    "bootstrap",
-)  # fmt: skip
+    *("tracks", "random driver", "agent driver", "order", "init", "vae", "mdn_rnn", "evolution"),
+    *("heldout", "bootstrap"),
+)
 
 
 def random_stream(purpose: str, seed: int, *numbers: int) -> np.random.Generator:
