@@ -286,9 +286,9 @@ def flatten(values: dict, prefix: str = "") -> dict:
 
 # The purposes that random numbers are drawn for. Each has its own stream; append, never reorder.
 STREAMS = (
-    *("tracks", "random driver", "agent driver", "order", "init", "vae", "mdn_rnn", "evolution"),
-    *("heldout", "bootstrap"),
-)
+    "tracks", "random driver", "agent driver", "order", "init", "vae", "mdn_rnn", "evolution",
+    "heldout", "bootstrap",
+)  # fmt: skip
 
 
 def random_stream(purpose: str, seed: int, *numbers: int) -> np.random.Generator:
