@@ -204,19 +204,17 @@ def replace(base: Any, values: dict) -> Any:
     return dataclasses.replace(base, **changed)
 
 
-def fields_of(config: Config) -> list[tuple[str, Any, Any]]:
+def fields_of(config: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
     """(dotted name, type, value) of every field, stage by stage."""
     found = []
     for one in dataclasses.fields(config):
-        value = getattr(config, one.name)
+        name, value = prefix + one.name, getattr(config, one.name)
         if not dataclasses.is_dataclass(one.type):
-            found.append((one.name, one.type, value))
-            continue
-        if not isinstance(value, one.type):
-            expected = f"a {one.type.__name__} or a dict of it"
-            raise ValueError(f"{one.name}={value!r}: expected {expected}")
-        for part in dataclasses.fields(value):
-            found.append((f"{one.name}.{part.name}", part.type, getattr(value, part.name)))
+            found.append((name, one.type, value))
+        elif isinstance(value, one.type):
+            found += fields_of(value, f"{name}.")
+        else:
+            raise ValueError(f"{name}={value!r}: expected a {one.type.__name__} or a dict of it")
     return found
 
 
@@ -236,15 +234,13 @@ def check_value(name: str, kind: Any, value: Any) -> None:
 
 def check_together(config: Config) -> None:
     """Raise ValueError for values that are valid alone but not together."""
-    frames, evolution = config.data.episode_frames, config.evolution
-    if frames <= config.vae.stride:
+    frames, stride = config.data.episode_frames, config.vae.stride
+    sequence, evolution = config.mdn_rnn.sequence, config.evolution
+    if frames <= stride:
+        raise ValueError(f"data.episode_frames={frames}: expected more than vae.stride={stride}")
+    if sequence >= frames:
         raise ValueError(
-            f"data.episode_frames={frames}: expected more than vae.stride={config.vae.stride},"
-            " before which no difference image exists"
-        )
-    if config.mdn_rnn.sequence >= frames:
-        raise ValueError(
-            f"mdn_rnn.sequence={config.mdn_rnn.sequence} does not fit into episodes of"
+            f"mdn_rnn.sequence={sequence} does not fit into episodes of"
             f" data.episode_frames={frames}: use at most {frames - 1}"
         )
     if evolution.generations % evolution.validate_every:
@@ -267,8 +263,7 @@ def check_same(path: Path, was: dict, now: dict) -> None:
     """
     then, now, defaults = flatten(was), flatten(now), flatten(Config().as_dict())
     for name, value in now.items():
-        before = then.get(name, defaults.get(name))
-        if before != value:
+        if (before := then.get(name, defaults.get(name))) != value:
             raise ValueError(
                 f"{path} was made with {name}={before!r}, now {name}={value!r} is asked for:"
                 " choose another folder, or the same settings"

@@ -49,20 +49,26 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
     pipeline.check_record(folder)
     record = load_json(folder / pipeline.RECORD, pipeline.GIVE_A_RUN, kind="record")
     config = Config.from_dict(record["config"])
-    checks: dict[str, Callable[[], str]] = {
-        "record": lambda: f"ok: {config.variant}",
-        "dataset": lambda: verify_dataset(folder / "dataset"),
-        "V": lambda: verify_vae(folder),
-        "M": lambda: verify_mdn_rnn(folder, config),
-        "log of CMA-ES": lambda: verify_log(folder, config),
-        "C": lambda: verify_controller(folder, config),
-        "evaluations": lambda: verify_evaluations(folder),
-        "episodes": lambda: drive_again(folder, config, executor),
+    models, log = (VAE_FILE, MDN_RNN_FILE), evolution.LOG
+    checks = {  # name -> the check, and the files without which there is nothing to check
+        "record": (lambda: f"ok: {config.variant}",),
+        "dataset": (lambda: verify_dataset(folder / "dataset"),),
+        "V": (lambda: verify_vae(folder), VAE_FILE),
+        "M": (lambda: check_mdn_rnn(config, folder) or "ok", MDN_RNN_FILE),
+        "log of CMA-ES": (lambda: verify_log(folder, config), *models, log),
+        # A C that has lost its V or M fails.
+        "C": (lambda: verify_controller(folder, config), log, CONTROLLER_FILE),
+        "evaluations": (lambda: verify_evaluations(folder),),
+        "episodes": (lambda: drive_again(folder, config, executor), *models, CONTROLLER_FILE),
     }
     here = pipeline.provenance("")
     others = [other_machine(start, here) for start in pipeline.starts(record)]
     excuse = "; ".join(filter(None, others))
-    return {name: outcome(check, excuse) for name, check in checks.items()}
+    found = {}
+    for name, (check, *needed) in checks.items():
+        there = all((folder / file).exists() for file in needed)
+        found[name] = outcome(check, excuse) if there else MISSING
+    return found
 
 
 def outcome(check: Callable[[], str], excuse: str) -> str:
@@ -98,23 +104,8 @@ def verify_dataset(folder: Path) -> str:
 def verify_vae(folder: Path) -> str:
     """Check V, and that it was trained on this dataset."""
     path = folder / VAE_FILE
-    if not path.exists():
-        return MISSING
     check_seen(path, load_vae(path)[1]["dataset"], folder / "dataset")
     return "ok"
-
-
-def verify_mdn_rnn(folder: Path, config: Config) -> str:
-    """Check M, and that it belongs to V."""
-    if not (folder / MDN_RNN_FILE).exists():
-        return MISSING
-    check_mdn_rnn(config, folder)
-    return "ok"
-
-
-def lacks(folder: Path, *names: str) -> bool:
-    """Whether one of these files, or V or M, is missing."""
-    return not all((folder / name).exists() for name in (VAE_FILE, MDN_RNN_FILE, *names))
 
 
 def logged(folder: Path, config: Config) -> tuple[Config, dict]:
@@ -126,8 +117,6 @@ def logged(folder: Path, config: Config) -> tuple[Config, dict]:
 
 def verify_log(folder: Path, config: Config) -> str:
     """Replay the log of CMA-ES: it must give the logged means."""
-    if lacks(folder, evolution.LOG):
-        return MISSING
     config, log = logged(folder, config)
     try:
         evolution.resume(config, folder, load_world_model(folder), log)
@@ -138,8 +127,6 @@ def verify_log(folder: Path, config: Config) -> str:
 
 def verify_controller(folder: Path, config: Config) -> str:
     """Check that C is the one with the best validation in the log, and that this is the best."""
-    if not all((folder / name).exists() for name in (evolution.LOG, CONTROLLER_FILE)):
-        return MISSING  # but a C that has lost its V or M fails below
     _, log = logged(folder, config)
     validated = [entry for entry in log["generations"] if "validation" in entry]
     best = max(validated, key=lambda entry: entry["validation"]["mean"], default=None)
@@ -169,11 +156,9 @@ def verify_evaluations(folder: Path) -> str:
 
 def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
     """Drive recorded episodes again: of an evaluation, or of the validation that chose C."""
-    if lacks(folder, CONTROLLER_FILE):
-        return MISSING
     parameters, _ = load_controller(folder / CONTROLLER_FILE)
     evaluations = [load_evaluation(file) for file in sorted(folder.glob("evaluation*.json"))]
-    if not evaluations and lacks(folder, evolution.LOG):
+    if not evaluations and not (folder / evolution.LOG).exists():
         return MISSING
     official = [one for one in evaluations if one["renderer"] == "gymnasium"]
     workers = worker_processes if official else worker_threads
