@@ -160,12 +160,12 @@ class EnvBatch:
 
     def step(self, actions: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Drive some cars one frame: their rewards, and whether their episodes have ended."""
-        rewards, ended = np.zeros(len(which)), np.zeros(len(which), bool)
-        for place, (car, action) in enumerate(zip(which, actions, strict=True)):
-            found = self.envs[car].step(action)
-            self.observations[car], rewards[place] = found[:2]
-            ended[place] = found[2] or found[3]
-        return rewards, ended
+        rewards, ended = [], []
+        for car, action in zip(which, actions, strict=True):
+            self.observations[car], reward, terminated, truncated, _ = self.envs[car].step(action)
+            rewards.append(reward)
+            ended.append(terminated or truncated)
+        return np.array(rewards, float), np.array(ended, bool)
 
 
 class Episodes(NamedTuple):

@@ -385,12 +385,7 @@ def ship(run: str, name: str) -> None:
 
 
 def film(
-    agent: str,
-    out: str,
-    viewer: bool = False,
-    track: int = 5,
-    first: int = 60,
-    frames: int = 240,
+    agent: str, out: str, viewer: bool = False, track: int = 5, first: int = 60, frames: int = 240
 ) -> None:
     """Make a film of an agent driving: observation, difference image, reconstruction and dream.
 

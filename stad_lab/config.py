@@ -181,7 +181,7 @@ class Config:
 
     def replace(self, **changes) -> "Config":
         """A copy with other values, for example `replace(seed=1, vae={"stride": 2})`."""
-        return replace(self, changes)
+        return with_values(self, changes)
 
     def as_dict(self) -> dict:
         """All fields as nested dicts, for JSON."""
@@ -190,17 +190,17 @@ class Config:
     @staticmethod
     def from_dict(values: dict) -> "Config":
         """The inverse of `as_dict`; a missing field has its default, an unknown one is refused."""
-        return replace(Config(), values)
+        return with_values(Config(), values)
 
 
-def replace(base: Any, values: dict) -> Any:
+def with_values(base: Any, values: dict) -> Any:
     """A copy of the dataclass `base` with the values of a nested dict."""
     known, changed = [one.name for one in dataclasses.fields(base)], {}
     for name, value in values.items():
         if name not in known:
             raise ValueError(f"unknown setting {name!r}: expected one of {', '.join(known)}")
         stage = getattr(base, name)
-        changed[name] = replace(stage, value) if isinstance(value, dict) else value
+        changed[name] = with_values(stage, value) if isinstance(value, dict) else value
     return dataclasses.replace(base, **changed)
 
 

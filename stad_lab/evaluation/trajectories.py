@@ -99,10 +99,8 @@ def road_in_sight(motion: np.ndarray) -> np.ndarray:
 
     Elsewhere the picture shows only grass, and no latent could encode where the road is.
     """
-    names = list(MOTION)
-    offset = motion[:, names.index("road offset")]
-    turned = motion[:, names.index("heading error")]
-    return (np.abs(offset) < 3) & (np.abs(turned) < np.pi / 2)
+    columns = dict(zip(MOTION, np.abs(motion).T, strict=True))
+    return (columns["road offset"] < 3) & (columns["heading error"] < np.pi / 2)
 
 
 def record(driver: Driver, cars: Cars, frames: int) -> Trajectory:

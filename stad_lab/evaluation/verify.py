@@ -49,11 +49,12 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
     pipeline.check_record(folder)
     record = load_json(folder / pipeline.RECORD, pipeline.GIVE_A_RUN, kind="record")
     config = Config.from_dict(record["config"])
+    dataset, vae = folder / "dataset", folder / VAE_FILE
     models, log = (VAE_FILE, MDN_RNN_FILE), evolution.LOG
     checks = {  # name -> the check, and the files without which there is nothing to check
         "record": (lambda: f"ok: {config.variant}",),
-        "dataset": (lambda: verify_dataset(folder / "dataset"),),
-        "V": (lambda: verify_vae(folder), VAE_FILE),
+        "dataset": (lambda: verify_dataset(dataset),),
+        "V": (lambda: check_seen(vae, load_vae(vae)[1]["dataset"], dataset) or "ok", VAE_FILE),
         "M": (lambda: check_mdn_rnn(config, folder) or "ok", MDN_RNN_FILE),
         "log of CMA-ES": (lambda: verify_log(folder, config), *models, log),
         # A C that has lost its V or M fails.
@@ -62,8 +63,8 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         "episodes": (lambda: drive_again(folder, config, executor), *models, CONTROLLER_FILE),
     }
     here = pipeline.provenance("")
-    others = [other_machine(start, here) for start in pipeline.starts(record)]
-    excuse = "; ".join(filter(None, others))
+    excuses = [other_machine(start, here) for start in pipeline.starts(record)]
+    excuse = "; ".join(filter(None, excuses))
     found = {}
     for name, (check, *needed) in checks.items():
         there = all((folder / file).exists() for file in needed)
@@ -99,13 +100,6 @@ def verify_dataset(folder: Path) -> str:
         return f"none: {made} of {wanted} episodes so far"
     dataset = Dataset(folder)
     return f"ok: {len(dataset.frames)} episodes, {len(dataset)} frames"
-
-
-def verify_vae(folder: Path) -> str:
-    """Check V, and that it was trained on this dataset."""
-    path = folder / VAE_FILE
-    check_seen(path, load_vae(path)[1]["dataset"], folder / "dataset")
-    return "ok"
 
 
 def logged(folder: Path, config: Config) -> tuple[Config, dict]:
