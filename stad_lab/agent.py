@@ -4,7 +4,9 @@ At every frame V encodes the frame and its difference image into z, C computes t
 M's memory h, and M updates its memory with z and the action. C sees the mean mu of z, not a sample.
 """
 
+import math
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -14,13 +16,7 @@ import torch
 
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
-from stad_lab.envs.frames import (
-    FRAME_SIZE,
-    FrameMemory,
-    earlier_frames,
-    to_frame,
-    to_pictures,
-)
+from stad_lab.envs.frames import FRAME_SIZE, FrameMemory, earlier_frames, to_frame, to_pictures
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
     WorldModel,
@@ -47,10 +43,8 @@ class Agent:
 
     Args:
         world_model: V and M.
-        parameters: of C, (parameters,), or one row for each car (cars, parameters).
-
-    Raises:
-        ValueError: parameters of another number than V's latents and M's memory ask for.
+        parameters: of C, (parameters,), or one row for each car (cars, parameters). ValueError if
+            their number does not fit V's latents and M's memory.
     """
 
     def __init__(self, world_model: WorldModel, parameters: np.ndarray):
@@ -70,29 +64,23 @@ class Agent:
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The action for one car: observation uint8 (96, 96, 3) -> float32 (3,).
 
-        Steering is in [-1, 1], gas and brake are in [0, 1].
-
-        Raises:
-            ValueError: another shape or dtype, or an action that is not finite.
+        Steering is in [-1, 1], gas and brake are in [0, 1]. ValueError for another shape or dtype,
+        or for an action that is not finite.
         """
         return self.act_batch([to_frame(observation, self.world_model.crop_bar)])[0]
 
     @torch.inference_mode()
     def act_batch(self, seen: Sequence[np.ndarray]) -> np.ndarray:
-        """The actions for a batch of cars: float32 (cars, 3).
+        """The actions for a batch of cars: float32 (cars, 3). ValueError as `act`.
 
         Args:
             seen: observations, uint8 (cars, 96, 96, 3), or frames, uint8 (cars, 64, 64, 3), with
-                the bar cropped as V was trained.
-
-        Raises:
-            ValueError: as `act`, or another number of cars than before without a `reset`.
+                the bar cropped as V was trained. Their number changes only by `keep` or `reset`.
         """
         self._check_count(len(seen))
-        if seen[0].shape[:2] == (FRAME_SIZE, FRAME_SIZE):
-            frames = np.asarray(seen)
-        else:
-            frames = np.stack([to_frame(one, self.world_model.crop_bar) for one in seen])
+        if seen[0].shape[:2] != (FRAME_SIZE, FRAME_SIZE):
+            seen = [to_frame(observation, self.world_model.crop_bar) for observation in seen]
+        frames = np.asarray(seen)
         if self.state is None:
             self.cars = np.arange(len(frames))
             zeros = torch.zeros(1, len(frames), self.mdn_rnn.hidden_size, dtype=torch.float32)
@@ -135,10 +123,9 @@ class Agent:
             raise ValueError("the agent has not acted yet: call agent.act(observation) first")
 
     def _check_count(self, count: int) -> None:
-        expected = len(self.parameters) if self.parameters.ndim == 2 else None
-        if self.cars is not None:
-            expected = len(self.cars)
-        if count == 0 or (expected is not None and count != expected):
+        controllers = len(self.parameters) if self.parameters.ndim == 2 else None
+        expected = controllers if self.cars is None else len(self.cars)
+        if count == 0 or expected not in (None, count):
             raise ValueError(
                 f"{count} observations, expected {expected or 'at least 1'}: give one for each car,"
                 " and call agent.reset() when an episode begins"
@@ -158,26 +145,8 @@ class Driver(Protocol):
         """Continue with some of the present cars, by their indices."""
 
 
-class Batch(Protocol):
-    """What `rollout` drives: the engine's `Cars`, or `EnvBatch`."""
-
-    def __len__(self) -> int:
-        """Number of cars."""
-
-    def draw(self, which: np.ndarray) -> np.ndarray:
-        """What some cars see: uint8 (n, 96, 96, 3) or (n, 64, 64, 3)."""
-
-    def step(self, actions: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Drive some cars one frame: their rewards, and whether their episodes have ended."""
-
-
 class EnvBatch:
-    """Gymnasium environments, which have been reset, as a batch.
-
-    Args:
-        envs: the environments.
-        observations: their first observations.
-    """
+    """Gymnasium environments as a batch, given with their first observations after a reset."""
 
     def __init__(self, envs: Sequence[gym.Env], observations: Sequence[np.ndarray]):
         self.envs, self.observations = envs, list(observations)
@@ -186,17 +155,17 @@ class EnvBatch:
         return len(self.envs)
 
     def draw(self, which: np.ndarray) -> np.ndarray:
-        """The observations of some cars, uint8 (n, 96, 96, 3)."""
+        """What some cars see."""
         return np.stack([self.observations[car] for car in which])
 
     def step(self, actions: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `Batch.step`."""
-        rewards, ended = np.zeros(len(which)), np.zeros(len(which), bool)
-        for place, (car, action) in enumerate(zip(which, actions, strict=True)):
-            found = self.envs[car].step(action)
-            self.observations[car], rewards[place] = found[:2]
-            ended[place] = found[2] or found[3]
-        return rewards, ended
+        """Drive some cars one frame: their rewards, and whether their episodes have ended."""
+        rewards, ended = [], []
+        for car, action in zip(which, actions, strict=True):
+            self.observations[car], reward, terminated, truncated, _ = self.envs[car].step(action)
+            rewards.append(reward)
+            ended.append(terminated or truncated)
+        return np.array(rewards, float), np.array(ended, bool)
 
 
 class Episodes(NamedTuple):
@@ -207,25 +176,21 @@ class Episodes(NamedTuple):
     rewards: list[list[float]]  # of every frame, for each episode
 
 
-Observe = Callable[[np.ndarray, np.ndarray, np.ndarray], None]
-
-
 def rollout(
     driver: Driver,
-    batch: Batch,
+    batch: Cars | EnvBatch,
     max_frames: int = MAX_FRAMES,
     patience: int = 0,
-    observe: Observe | None = None,
+    observe: Callable[[np.ndarray, np.ndarray, np.ndarray], None] | None = None,
 ) -> Episodes:
     """Drive one episode with each car of a batch.
 
     Args:
         driver: is shown what the cars see whose episodes go on.
         batch: of cars at the start of their episodes.
-        max_frames: frames of an episode, at most (CarRacing's own limit is 1,000).
+        max_frames: of an episode, at most 1,000 as in CarRacing.
         patience: an episode ends after so many frames without a new tile; 0 for never.
-        observe: called before every step with the numbers of the cars, what they see and their
-            actions, for example to record them.
+        observe: called before every step with the numbers of the cars, what they see, and actions.
     """
     if max_frames < 1:
         raise ValueError(f"max_frames={max_frames}: expected at least 1")
@@ -244,13 +209,11 @@ def rollout(
         for car, reward in zip(driving, gained.tolist(), strict=True):
             rewards[car].append(reward)
         last_tile[driving[gained > 0]] = length
-        going_on = ~ended
-        if patience:
-            going_on &= length - last_tile[driving] < patience
+        going_on = ~ended & (length - last_tile[driving] < (patience or math.inf))
+        driving = driving[going_on]
+        if not len(driving):
+            break
         if not going_on.all():
-            driving = driving[going_on]
-            if not len(driving):
-                break
             driver.keep(np.flatnonzero(going_on))
     return Episodes(returns, np.array([len(own) for own in rewards]), rewards)
 
@@ -261,8 +224,7 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
     Args:
         agent: its parameters are one vector, or one row for each track.
         tracks: seeds of the tracks, at least 0.
-        fast: drive with our engine, which draws the agent's frames directly, or in Gymnasium's own
-            environment.
+        fast: use our engine, which draws the agent's frames directly, not Gymnasium's environment.
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
     """
     tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
@@ -272,14 +234,10 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
         cars = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)
         cars.reset(tracks)
         return rollout(agent, cars, **limits)
-    envs = [make_env(fast=False) for _ in tracks]
-    try:
-        pairs = zip(envs, tracks, strict=True)
-        batch = EnvBatch(envs, [env.reset(seed=track)[0] for env, track in pairs])
-        return rollout(agent, batch, **limits)
-    finally:
-        for env in envs:
-            env.close()
+    with ExitStack() as stack:
+        envs = [stack.enter_context(make_env(fast=False)) for _ in tracks]
+        first = [env.reset(seed=track)[0] for env, track in zip(envs, tracks, strict=True)]
+        return rollout(agent, EnvBatch(envs, first), **limits)
 
 
 @torch.no_grad()
@@ -328,7 +286,7 @@ def load_agent(source: str | Path) -> Agent:
     Args:
         source: "frame", "input", "output" or "input_output" for the shipped agents, which are of
             one recipe (but the second iteration of "input" replayed no hard tracks); the name of
-            another shipped agent; or the folder of a run. Give a folder of such a name as a Path.
+            another shipped agent; or the folder of a run, as a Path where it could be such a name.
 
     Raises:
         FileNotFoundError: no such agent, or its run is not finished.

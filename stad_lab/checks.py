@@ -69,9 +69,8 @@ def agree(found: np.ndarray, other: np.ndarray, tolerance: float) -> bool:
     if found.shape != other.shape or found.dtype.kind not in "biuf":
         return False
     largest = float(np.abs(other[np.isfinite(other)], dtype=float).max(initial=0))
-    scale = largest or 1.0  # of an answer that is all zeros
-    same = {"rtol": 0, "atol": tolerance * scale + 1e-12, "equal_nan": True}
-    return np.allclose(found.astype(float), other.astype(float), **same)
+    error = tolerance * (largest or 1.0) + 1e-12  # 1 for an answer that is all zeros
+    return np.allclose(found.astype(float), other.astype(float), 0, error, equal_nan=True)
 
 
 def describe_difference(found: np.ndarray, expected: np.ndarray) -> str:

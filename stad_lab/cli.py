@@ -9,7 +9,7 @@ import functools
 import io
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Annotated, Literal
@@ -27,12 +27,13 @@ EXTRAS = {"matplotlib": "lab", "PIL": "lab", "distributed": "cluster", "envpool"
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status. A user's error ends in one line."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    escape_foreign_letters()
-    command = arguments[0] if arguments else ""
+    if hasattr(sys.stdout, "reconfigure"):  # the console may lack letters of a folder's name
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         return parse(arguments)() or 0
     except KeyboardInterrupt:
-        again = "; the same command continues from there" if command in CONTINUES else ""
+        continues = arguments and arguments[0] in CONTINUES
+        again = "; the same command continues from there" if continues else ""
         print(f"\nstopped{again}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # the reader of our output has gone, as with `| head`
@@ -47,10 +48,12 @@ def main(arguments: list[str] | None = None) -> int:
 def parse(arguments: list[str]) -> Callable[[], int | None]:
     """The command that the arguments ask for, ready to be called.
 
-    tyro calls a command as soon as it has parsed it; this defers it, so that what the parser writes
-    is told from what the command writes. Wrong usage raises ValueError with one line.
+    tyro calls a command as soon as it has parsed it; this defers it, so that only what the parser
+    writes is caught. Wrong usage raises ValueError with one line.
     """
-    preset, arguments = take_preset(arguments)
+    preset = None
+    if arguments[:1] == ["train"] and len(arguments) > 1 and not arguments[1].startswith("-"):
+        preset, arguments = arguments[1], ["train", *arguments[2:]]
     commands = COMMANDS | {"train": training_command(Config.preset(preset))}
     told = io.StringIO()
     try:
@@ -78,26 +81,20 @@ def deferred(command: Callable) -> Callable:
     return later
 
 
-def take_preset(arguments: list[str]) -> tuple[str | None, list[str]]:
-    """The preset named after `train`, if there is one, and the other arguments."""
-    if arguments[:1] == ["train"] and len(arguments) > 1 and not arguments[1].startswith("-"):
-        return arguments[1], [arguments[0], *arguments[2:]]
-    return None, arguments
-
-
 def one_line(message: str) -> str:
     """The parser's message without its frame, and without its advice on --help."""
     lines = [re.sub(r"[─│╭╮╰╯]+|-{9,}", "", line).strip() for line in message.splitlines()]
     kept = [line for line in lines if line and line.lower() != "error"]
-    text = " ".join(kept).partition("Argument helptext")[0].partition("For full helptext")[0]
-    return re.sub(
-        r"^(Value error|Parsing error|Unrecognized options|Required options) ", "", text
-    ).strip()
+    text = re.split("Argument helptext|For full helptext", " ".join(kept))[0]
+    title = "^(Value error|Parsing error|Unrecognized options|Required options) "
+    return re.sub(title, "", text).strip()
 
 
 def explain(error: Exception) -> str | None:
     """One line for an error of the user or of the machine; None for a fault of ours."""
-    if isinstance(error, MemoryError | OverflowError) or is_out_of_memory(error):
+    short = re.search("out of memory|allocate memory|could not create a primitive", str(error))
+    torch_is_short = isinstance(error, RuntimeError) and short  # PyTorch has no error of its own
+    if isinstance(error, MemoryError | OverflowError) or torch_is_short:
         return f"too large for this machine: {error or type(error).__name__}"
     if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
         return f"{error}: pip install 'stad_lab[{EXTRAS[error.name]}]'"
@@ -107,28 +104,13 @@ def explain(error: Exception) -> str | None:
     return None
 
 
-def is_out_of_memory(error: Exception) -> bool:
-    """Whether a RuntimeError says that memory is short: PyTorch has no error of its own."""
-    short = ("out of memory", "allocate memory", "could not create a primitive")
-    return isinstance(error, RuntimeError) and any(words in str(error) for words in short)
-
-
-def escape_foreign_letters() -> None:
-    """Print letters that the console does not have, of a folder's name for example, as escapes."""
-    if hasattr(sys.stdout, "reconfigure"):
-        sys.stdout.reconfigure(errors="backslashreplace")
-
-
-@contextlib.contextmanager
-def cluster_of(scheduler: str | None) -> Iterator[Executor | None]:
+def cluster_of(scheduler: str | None) -> contextlib.AbstractContextManager[Executor | None]:
     """The executor of a Dask cluster, or None for this machine's own processes."""
     if scheduler is None:
-        yield None
-        return
+        return contextlib.nullcontext()
     from stad_lab.io.dask_cluster import cluster
 
-    with cluster(scheduler) as executor:
-        yield executor
+    return cluster(scheduler)
 
 
 def output(path: str) -> Path:
@@ -136,6 +118,23 @@ def output(path: str) -> Path:
     if not path.strip():
         raise ValueError("--out is empty: give the name of a folder or file, such as runs/input")
     return Path(path)
+
+
+def result_file(file: Path | None, source: str, kind: str, details: str = "") -> Path:
+    """Where a result of an agent goes: by default into its run, or here for a shipped one.
+
+    Raises an OSError or ValueError, before any work, if it cannot or must not be written.
+    """
+    from stad_lab.agent import PRETRAINED, run_folder
+    from stad_lab.evaluation.evaluate import check_output
+    from stad_lab.io.files import check_writable
+
+    run = run_folder(source)
+    name = f"{kind}-{run.name}{details}.json"
+    file = file or (Path(name) if run.parent == PRETRAINED else run / name)
+    check_writable(file)
+    check_output(file)
+    return file
 
 
 def check() -> int:
@@ -235,16 +234,14 @@ def evaluate(
         json: Where to write every episode; by default into the run, or here for a shipped agent.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
-    from stad_lab.agent import load_agent, run_folder
-    from stad_lab.evaluation.evaluate import check_output, describe, evaluate
-    from stad_lab.io.files import check_writable, save_json
+    from stad_lab.agent import load_agent
+    from stad_lab.evaluation.evaluate import describe, evaluate
+    from stad_lab.io.files import save_json
 
+    load_agent(agent)
     other = "-fast" * fast + f"-from-{first_track}" * (first_track != 0)
     other += f"-{episodes}-tracks" * (episodes != 100)
-    file = json or result_folder(agent) / f"evaluation-{run_folder(agent).name}{other}.json"
-    load_agent(agent)
-    check_writable(file)
-    check_output(file)
+    file = result_file(json, agent, "evaluation", other)
     unfinished = file.with_name(f"unfinished-{file.name}")
     with cluster_of(scheduler) as executor:
         result = evaluate(agent, episodes, first_track, fast, processes, executor, unfinished)
@@ -254,14 +251,6 @@ def evaluate(
         save_json(file, result)
         unfinished.unlink(missing_ok=True)
     print(f"  every episode: {file}")
-
-
-def result_folder(agent: str) -> Path:
-    """Where results of an agent go: into its run, or into this folder for a shipped one."""
-    from stad_lab.agent import PRETRAINED, run_folder
-
-    folder = run_folder(agent)
-    return Path() if folder.parent == PRETRAINED else folder
 
 
 def verify(run: tyro.conf.Positional[str]) -> int:
@@ -329,15 +318,12 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
         json: Where to write the result; by default into the run, or here for a shipped agent.
     """
     from stad_lab.agent import run_folder
-    from stad_lab.evaluation.evaluate import check_output
-    from stad_lab.io.files import check_writable, save_json
+    from stad_lab.io.files import save_json
     from stad_lab.io.weights import load_world_model
     from stad_lab.replication.latents import describe_probe, probe_run
 
-    file = json or result_folder(run) / f"probe-{run_folder(run).name}.json"
     load_world_model(run_folder(run))
-    check_writable(file)
-    check_output(file)
+    file = result_file(json, run, "probe")
     found = probe_run(run, episodes, processes)
     print(describe_probe(found), flush=True)
     save_json(file, found)
@@ -399,12 +385,7 @@ def ship(run: str, name: str) -> None:
 
 
 def film(
-    agent: str,
-    out: str,
-    viewer: bool = False,
-    track: int = 5,
-    first: int = 60,
-    frames: int = 240,
+    agent: str, out: str, viewer: bool = False, track: int = 5, first: int = 60, frames: int = 240
 ) -> None:
     """Make a film of an agent driving: observation, difference image, reconstruction and dream.
 

@@ -21,34 +21,22 @@ PRESET_VARIABLE = "STAD_LAB_PRESET"
 VARIANTS = ("frame", "input", "output", "input_output")
 SMALLEST_SIGMA = 1e-12  # near 0 CMA-ES cannot compute
 
-# (lowest, highest) value of a field; an int or float that is not listed is at least 1, or above 0.
-RANGES = {
-    "seed": (0, 2**63),
-    "processes": (1, 10_000),
-    "data.episodes": (2, 1_000_000),  # one to train on, one held out
-    "data.episode_frames": (1, 1000),  # CarRacing ends an episode then
-    "data.random_starts": (0, 1),
-    "data.agent_episodes": (0, 1_000_000),
-    "data.agent_frames": (1, 1000),
-    "data.agent_patience": (0, 1e12),
-    "vae.latent_size": (1, 10_000),
-    "vae.width": (1, 1000),
-    "vae.kl_weight": (0, 1e12),
-    "vae.free_bits": (0, 1e12),
-    "vae.difference_weight": (0, 1e12),
-    "mdn_rnn.hidden_size": (1, 10_000),
-    "mdn_rnn.mixtures": (1, 1000),
-    "mdn_rnn.steps": (0, 1e12),
-    "evolution.seed": (0, 2**63),
-    "evolution.population": (4, 100_000),
-    "evolution.replay_share": (0, 1),
-    "evolution.sigma_decay": (0, 1),
-    "evolution.components": (0, 1e12),
-    "evolution.initial_gas": (-100, 1e12),
-    "evolution.patience": (0, 1e12),
-    "evolution.max_frames": (1, 1000),
-    "evolution.averaged_share": (0, 1),
+# (lowest, highest) value of fields; any other int is at least 1, any other float above 0.
+BOUNDS = {
+    (0, 1): "data.random_starts evolution.averaged_share evolution.replay_share"
+    " evolution.sigma_decay",
+    (0, 1e12): "data.agent_patience evolution.components evolution.patience mdn_rnn.steps"
+    " vae.difference_weight vae.free_bits vae.kl_weight",
+    (-100, 1e12): "evolution.initial_gas",
+    (0, 1_000_000): "data.agent_episodes",
+    (0, 2**63): "seed evolution.seed",
+    (1, 1000): "data.agent_frames data.episode_frames evolution.max_frames mdn_rnn.mixtures"
+    " vae.width",  # CarRacing ends an episode after 1,000 frames
+    (1, 10_000): "mdn_rnn.hidden_size processes vae.latent_size",
+    (2, 1_000_000): "data.episodes",  # one to train on, one held out
+    (4, 100_000): "evolution.population",
 }
+RANGES = {name: bounds for bounds, names in BOUNDS.items() for name in names.split()}
 
 
 @dataclass(frozen=True)
@@ -179,15 +167,12 @@ class Config:
 
     @staticmethod
     def preset(name: str | None = None, /, **changes) -> "Config":
-        """Look up a preset and change some fields.
+        """Look up a preset and change some fields, as `replace` does.
 
         Args:
             name: "quick", "laptop" or "paper"; None reads the environment variable STAD_LAB_PRESET,
                 and takes "laptop" if that is not set.
             **changes: as for `replace`.
-
-        Raises:
-            ValueError: an unknown preset or field, or a value out of range.
         """
         name = name or os.environ.get(PRESET_VARIABLE) or "laptop"
         if name not in PRESETS:
@@ -196,7 +181,7 @@ class Config:
 
     def replace(self, **changes) -> "Config":
         """A copy with other values, for example `replace(seed=1, vae={"stride": 2})`."""
-        return from_dict(Config, changes, self)
+        return with_values(self, changes)
 
     def as_dict(self) -> dict:
         """All fields as nested dicts, for JSON."""
@@ -205,40 +190,31 @@ class Config:
     @staticmethod
     def from_dict(values: dict) -> "Config":
         """The inverse of `as_dict`; a missing field has its default, an unknown one is refused."""
-        return from_dict(Config, values, Config())
+        return with_values(Config(), values)
 
 
-def from_dict(kind: type, values: dict, base: Any) -> Any:
+def with_values(base: Any, values: dict) -> Any:
     """A copy of the dataclass `base` with the values of a nested dict."""
-    known = {one.name: one.type for one in dataclasses.fields(kind)}
-    for name in values:
+    known, changed = [one.name for one in dataclasses.fields(base)], {}
+    for name, value in values.items():
         if name not in known:
             raise ValueError(f"unknown setting {name!r}: expected one of {', '.join(known)}")
-    nested = {
-        name: from_dict(known[name], value, getattr(base, name))
-        if isinstance(value, dict)
-        else value
-        for name, value in values.items()
-    }
-    return dataclasses.replace(base, **nested)
+        stage = getattr(base, name)
+        changed[name] = with_values(stage, value) if isinstance(value, dict) else value
+    return dataclasses.replace(base, **changed)
 
 
-def fields_of(config: Config) -> list[tuple[str, Any, Any]]:
+def fields_of(config: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
     """(dotted name, type, value) of every field, stage by stage."""
     found = []
     for one in dataclasses.fields(config):
-        value = getattr(config, one.name)
+        name, value = prefix + one.name, getattr(config, one.name)
         if not dataclasses.is_dataclass(one.type):
-            found.append((one.name, one.type, value))
-            continue
-        if not isinstance(value, one.type):
-            raise ValueError(
-                f"{one.name}={value!r}: expected a {one.type.__name__} or a dict of it"
-            )
-        found += [
-            (f"{one.name}.{part.name}", part.type, getattr(value, part.name))
-            for part in dataclasses.fields(one.type)
-        ]
+            found.append((name, one.type, value))
+        elif isinstance(value, one.type):
+            found += fields_of(value, f"{name}.")
+        else:
+            raise ValueError(f"{name}={value!r}: expected a {one.type.__name__} or a dict of it")
     return found
 
 
@@ -258,15 +234,13 @@ def check_value(name: str, kind: Any, value: Any) -> None:
 
 def check_together(config: Config) -> None:
     """Raise ValueError for values that are valid alone but not together."""
-    frames, evolution = config.data.episode_frames, config.evolution
-    if frames <= config.vae.stride:
+    frames, stride = config.data.episode_frames, config.vae.stride
+    sequence, evolution = config.mdn_rnn.sequence, config.evolution
+    if frames <= stride:
+        raise ValueError(f"data.episode_frames={frames}: expected more than vae.stride={stride}")
+    if sequence >= frames:
         raise ValueError(
-            f"data.episode_frames={frames}: expected more than vae.stride={config.vae.stride},"
-            " before which no difference image exists"
-        )
-    if config.mdn_rnn.sequence >= frames:
-        raise ValueError(
-            f"mdn_rnn.sequence={config.mdn_rnn.sequence} does not fit into episodes of"
+            f"mdn_rnn.sequence={sequence} does not fit into episodes of"
             f" data.episode_frames={frames}: use at most {frames - 1}"
         )
     if evolution.generations % evolution.validate_every:
@@ -278,8 +252,7 @@ def check_together(config: Config) -> None:
     if evolution.sigma_decay and last_sigma < SMALLEST_SIGMA:
         raise ValueError(
             f"evolution.sigma_decay={evolution.sigma_decay} shrinks sigma={evolution.sigma} below"
-            f" {SMALLEST_SIGMA} in {evolution.generations} generations: use a factor nearer to 1,"
-            " or 0 for CMA-ES's own step size"
+            f" {SMALLEST_SIGMA} in {evolution.generations} generations: use one nearer to 1, or 0"
         )
 
 
@@ -290,8 +263,7 @@ def check_same(path: Path, was: dict, now: dict) -> None:
     """
     then, now, defaults = flatten(was), flatten(now), flatten(Config().as_dict())
     for name, value in now.items():
-        before = then.get(name, defaults.get(name))
-        if before != value:
+        if (before := then.get(name, defaults.get(name))) != value:
             raise ValueError(
                 f"{path} was made with {name}={before!r}, now {name}={value!r} is asked for:"
                 " choose another folder, or the same settings"
@@ -310,8 +282,7 @@ def flatten(values: dict, prefix: str = "") -> dict:
 # The purposes that random numbers are drawn for. Each has its own stream; append, never reorder.
 STREAMS = (
     "tracks", "random driver", "agent driver", "order", "init", "vae", "mdn_rnn", "evolution",
-    "heldout",
-    "bootstrap",
+    "heldout", "bootstrap",
 )  # fmt: skip
 
 

@@ -14,9 +14,7 @@ from stad_lab.models.controller import control
 def make_dream(source: str | Path = "frame", **options) -> DreamEnv:
     """The dream of an agent; `gymnasium.make("stad_lab:StadLab/Dream-v0")` calls this.
 
-    Args:
-        source: name of a shipped agent, or the folder of a run with V and M.
-        **options: as for `DreamEnv`, for example `temperature=0.5`.
+    `source` is a shipped agent, or the folder of a run with V and M; the options are `DreamEnv`'s.
     """
     world_model = load_world_model(run_folder(source))
     return DreamEnv(world_model.vae, world_model.mdn_rnn, **options)
@@ -44,17 +42,11 @@ def dream_on(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Continue an agent's episode in the dream: from here on C sees what M predicts.
 
-    The first z is sampled from M's prediction after the agent's last action. The agent is not
-    changed.
-
-    Args:
-        agent: has acted since its last reset, and drives one car.
+    The first z is sampled from M's prediction after the agent's last action. The agent drives one
+    car, has acted since its last reset, and is not changed.
 
     Returns:
         The dreamed frames, uint8 (frames, 64, 64, 3), and the actions, float32 (frames, 3).
-
-    Raises:
-        ValueError: another agent, or fewer than one frame.
     """
     if agent.state is None:
         raise ValueError("the agent has not acted yet: let it drive some real frames first")

@@ -31,9 +31,6 @@ class DreamEnv(gym.Env):
         temperature: 1 samples from M's own distribution, below 1 from a narrower one.
         max_frames: length of a dream.
         render_mode: "rgb_array" for pictures from `render()`, or None.
-
-    Raises:
-        ValueError: a temperature that is not above 0, or another render mode.
     """
 
     metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": 50}
@@ -60,18 +57,13 @@ class DreamEnv(gym.Env):
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
     ) -> tuple[np.ndarray, dict]:
-        """Begin a dream.
+        """Begin a dream; returns z and {"hidden": h}.
 
         Args:
             seed: of the dream's random source.
             options: {"latents": the first z, float32 (latent_size,), "state": M's memory (h, c)};
                 without "latents" z is sampled from N(0, 1), without "state" the memory is empty.
-
-        Returns:
-            z and {"hidden": h}.
-
-        Raises:
-            ValueError: latents or a memory of another shape, or not finite.
+                ValueError for another shape or numbers that are not finite.
         """
         super().reset(seed=seed)
         options = options or {}
@@ -95,12 +87,7 @@ class DreamEnv(gym.Env):
 
     @torch.no_grad()
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Dream one frame: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h}).
-
-        Raises:
-            ValueError: an action that is not three finite numbers, or an invalid `temperature`.
-            RuntimeError: called before `reset`.
-        """
+        """Dream one frame: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h})."""
         self._check_begun("step")
         action = np.asarray(action, np.float32)
         if action.shape != (ACTION_SIZE,) or not np.isfinite(action).all():
@@ -115,11 +102,7 @@ class DreamEnv(gym.Env):
 
     @torch.no_grad()
     def render(self) -> np.ndarray | None:
-        """What V decodes from the present z: uint8 (64, 64, 3); None without a render mode.
-
-        Raises:
-            RuntimeError: called before `reset`.
-        """
+        """What V decodes from the present z: uint8 (64, 64, 3); None without a render mode."""
         if self.render_mode is None:
             return None
         self._check_begun("render")

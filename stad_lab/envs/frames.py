@@ -17,20 +17,18 @@ OBSERVATION_SHAPE = (OBSERVATION_SIZE, OBSERVATION_SIZE, 3)
 
 
 def to_frame(observation: np.ndarray, crop_bar: bool = True) -> np.ndarray:
-    """Shrink an observation to a frame.
+    """Shrink an observation, uint8 (96, 96, 3), to a frame, uint8 (64, 64, 3).
 
-    Args:
-        observation: uint8 (96, 96, 3).
-        crop_bar: cut off the indicator bar first. The bar shows speed, wheel speeds, steering and
-            yaw rate, so with it a single frame shows the motion.
-
-    Returns:
-        uint8 (64, 64, 3).
-
-    Raises:
-        ValueError: another shape or dtype.
+    `crop_bar` cuts off the indicator bar first. The bar shows speed, wheel speeds, steering and yaw
+    rate, so with it a single frame shows the motion. ValueError for another shape or dtype.
     """
-    check_observation(observation)
+    dtype = getattr(observation, "dtype", type(observation).__name__)
+    shape = getattr(observation, "shape", "no shape")
+    if dtype != np.uint8 or shape != OBSERVATION_SHAPE:
+        raise ValueError(
+            f"observation with dtype {dtype} and shape {shape}: expected uint8 and"
+            f" {OBSERVATION_SHAPE}, as CarRacing-v3 gives it without wrappers that change it"
+        )
     picture = observation[:BAR_TOP] if crop_bar else observation
     return cv2.resize(picture, (FRAME_SIZE, FRAME_SIZE), interpolation=cv2.INTER_AREA)
 
@@ -46,14 +44,10 @@ def difference_image(frame: np.ndarray, earlier: np.ndarray) -> np.ndarray:
 
 
 def to_pictures(frames: np.ndarray, earlier: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What V sees: normalised frames in [0, 1] and their difference images in [-1, 1], float32.
+    """What V sees: frames in [0, 1] and their difference images in [-1, 1], float32.
 
-    Args:
-        frames: uint8, for example (batch, 64, 64, 3).
-        earlier: the frames `stride` before them, of the same shape.
-
-    Raises:
-        ValueError: shapes that differ, or another dtype.
+    `earlier` holds the frames `stride` before `frames`. Both are uint8 of one shape, for example
+    (batch, 64, 64, 3); ValueError if not.
     """
     if frames.shape != earlier.shape or frames.dtype != np.uint8 or earlier.dtype != np.uint8:
         raise ValueError(
@@ -99,18 +93,6 @@ class FrameMemory:
         """Add the newest frame; returns the one `stride` before it, or itself at the start."""
         self.frames.append(frame)
         return self.frames[0] if len(self.frames) == self.frames.maxlen else frame
-
-
-def check_observation(observation: np.ndarray) -> None:
-    """Raise ValueError unless `observation` is uint8 (96, 96, 3), as CarRacing makes it."""
-    dtype = getattr(observation, "dtype", type(observation).__name__)
-    shape = getattr(observation, "shape", "no shape")
-    if dtype != np.uint8 or shape != OBSERVATION_SHAPE:
-        raise ValueError(
-            f"observation with dtype {dtype} and shape {shape}: expected uint8 and"
-            f" {OBSERVATION_SHAPE}, as CarRacing-v3 gives it, from an environment without wrappers"
-            " that change the observation"
-        )
 
 
 def check_stride(stride: int) -> None:

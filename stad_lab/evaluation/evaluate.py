@@ -39,8 +39,7 @@ def evaluate(
         source: of the agent, as for `load_agent`.
         episodes: number of tracks, each driven once, to its end.
         fast: render with the fast renderer instead of Gymnasium's own.
-        processes: threads, or processes for Gymnasium's renderer; the numbers do not depend on
-            them.
+        processes: processes, or threads if `fast`; the numbers do not depend on them.
         executor: who drives; None for so many workers of this machine.
         unfinished: file that keeps what was driven, so that an interrupted evaluation continues.
 
@@ -49,14 +48,16 @@ def evaluate(
         C), what `summarise` computes, "seconds", and "episodes": "track", "return" and "frames".
 
     Raises:
-        ValueError: tracks outside the range for tests, or an agent that cannot be loaded.
-        FileNotFoundError: no such agent.
+        ValueError: tracks outside the range for tests; and what `load_agent` raises.
         TaskError: an episode failed.
     """
     check_tracks(episodes, first_track)
     agent, tracks = load_agent(source), list(range(first_track, first_track + episodes))
     identity = describe_agent(agent, fast)
-    asked = {**identity, "tracks": tracks, **weights_of(agent)}
+    models = {"vae": agent.vae, "mdn_rnn": agent.mdn_rnn}
+    # Of V and M as they are loaded: a shipped agent's may be of lower precision.
+    weights = {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
+    asked = {**identity, "tracks": tracks, **weights}
     known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
     driven = known["driven"] if known.get("asked") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
@@ -66,14 +67,9 @@ def evaluate(
         # One car at a time: in a batch the last bits differ from those of a car that drives alone.
         share = hand_out(executor, run_folder(source))
         tasks = [(share, agent.parameters, [track], fast) for track in missing]
-        bar = tqdm(
-            run_tasks(executor, drive_group, tasks),
-            f"evaluate ({identity['variant']})",
-            len(tracks),
-            initial=len(driven),
-            unit="episode",
-        )
-        for number, (returns, lengths) in bar:
+        results = run_tasks(executor, drive_group, tasks)
+        shown = {"total": len(tracks), "initial": len(driven), "unit": "episode"}
+        for number, (returns, lengths) in tqdm(results, f"evaluate ({agent.vae.variant})", **shown):
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
                 now = {"asked": asked, "driven": driven, "seconds": time.perf_counter() - begin}
@@ -103,12 +99,6 @@ def describe_agent(agent: Agent, fast: bool) -> dict:
     }
 
 
-def weights_of(agent: Agent) -> dict[str, str]:
-    """Checksums of V and M as they are loaded: a shipped agent's may be of lower precision."""
-    models = {"vae": agent.vae, "mdn_rnn": agent.mdn_rnn}
-    return {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
-
-
 def report(tracks: list[int], returns: np.ndarray, lengths: np.ndarray) -> dict:
     """The summary of some returns, and every episode: its track, return and length in frames."""
     episodes = [
@@ -132,17 +122,12 @@ def check_output(path: Path) -> None:
 
 
 def load_evaluation(path: Path) -> dict:
-    """Read an evaluation, and check that its summary is that of its episodes.
-
-    Raises:
-        FileNotFoundError: no such file.
-        ValueError: damaged, changed, without episodes, or with a track twice.
-    """
+    """Read an evaluation. ValueError unless its summary is that of its episodes."""
     found = load_json(path, "evaluate again", kind=KIND)
     episodes = found.get("episodes", [])
-    tracks = [episode["track"] for episode in episodes]
-    if not episodes or len(set(tracks)) < len(tracks):
-        raise ValueError(f"{path} has {len(tracks)} episodes on {len(set(tracks))} tracks")
+    tracks = {episode["track"] for episode in episodes}
+    if not episodes or len(tracks) < len(episodes):
+        raise ValueError(f"{path} has {len(episodes)} episodes on {len(tracks)} tracks")
     summary = summarise(np.array([episode["return"] for episode in episodes]))
     for name, value in summary.items():
         if found.get(name) != value:

@@ -24,11 +24,7 @@ CHUNK = 250  # frames that V reconstructs at once
 def region_masks(frames: np.ndarray) -> dict[str, np.ndarray]:
     """Which pixels are road (with kerbs), grass (with what lies beyond the field) and car.
 
-    Args:
-        frames: uint8 (n, 64, 64, 3), without the indicator bar.
-
-    Returns:
-        bool (n, 64, 64) for each of REGIONS.
+    Frames uint8 (n, 64, 64, 3), without the indicator bar -> bool (n, 64, 64) for each of REGIONS.
     """
     red, green = frames[..., 0].astype(np.int16), frames[..., 1].astype(np.int16)
     grass = (green - red > 30) | (green < 20) & (red < 20)
@@ -40,21 +36,14 @@ def region_masks(frames: np.ndarray) -> dict[str, np.ndarray]:
 class Reconstruction(NamedTuple):
     """What V makes of n frames."""
 
-    frames: np.ndarray
-    """float32 (n, 64, 64, 3) in [0, 1]."""
-    differences: np.ndarray | None
-    """float32 (n, 64, 64, 3) in [-1, 1]; None for a variant that does not reconstruct them."""
-    kl: np.ndarray
-    """float32 (n, latent_size), nats."""
+    frames: np.ndarray  # float32 (n, 64, 64, 3) in [0, 1]
+    differences: np.ndarray | None  # likewise in [-1, 1]; None if V does not reconstruct them
+    kl: np.ndarray  # float32 (n, latent_size), nats
 
 
 @torch.no_grad()
 def reconstruct(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> Reconstruction:
-    """Encode and decode frames, uint8 (n, 64, 64, 3), through the mean of z.
-
-    Args:
-        earlier: the frames to subtract from them.
-    """
+    """Encode and decode frames, uint8 (n, 64, 64, 3), through the mean of z."""
     count = max(1, len(frames) // CHUNK)
     parts = []
     for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
@@ -68,10 +57,7 @@ def reconstruct(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> Reconstruc
 
 
 def vae_metrics(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> dict:
-    """Measure V on unseen frames.
-
-    Args:
-        frames, earlier: uint8 (n, 64, 64, 3), without the indicator bar.
+    """Measure V on unseen frames, uint8 (n, 64, 64, 3), without the indicator bar.
 
     Returns:
         A dict for JSON. "frame_error" and "difference_error" (None if not reconstructed) are
@@ -116,11 +102,7 @@ def constant_prediction(training: np.ndarray, latents: np.ndarray) -> np.ndarray
 def repeat_prediction(training: np.ndarray, latents: np.ndarray) -> np.ndarray:
     """NLL of a Gaussian around the last z, with the deviation of the steps of z.
 
-    Args:
-        training, latents: z of episodes, float32 (episodes, T, latent_size).
-
-    Returns:
-        Nats, (episodes, T - 1, latent_size).
+    z of episodes, float32 (episodes, T, latent_size) -> nats (episodes, T - 1, latent_size).
     """
     return gaussian_nll(np.diff(latents, axis=1), np.diff(training, axis=1).std(axis=(0, 1)))
 
@@ -178,11 +160,8 @@ def single_step_nll(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -
 def pit(mixture: Mixture, latents: np.ndarray) -> np.ndarray:
     """The probability integral transform: the predicted probability below the true value.
 
-    If the predictions are calibrated, these numbers are uniform in [0, 1]. Too many near 0 and 1:
-    M is overconfident; too many in the middle: underconfident.
-
-    Returns:
-        float32 (episodes, T - 1, latent_size).
+    float32 (episodes, T - 1, latent_size). Calibrated predictions make them uniform in [0, 1]. Too
+    many near 0 and 1: M is overconfident; too many in the middle: underconfident.
     """
     target = torch.from_numpy(latents[:, 1:, :, None])
     below = torch.special.ndtr((target - mixture.mean) * torch.exp(-mixture.logsigma))
@@ -198,13 +177,11 @@ def dream_open_loop(
     dreams: int = 16,
     temperature: float = 1.0,
 ) -> np.ndarray:
-    """Let M dream on with the actions that were really taken.
+    """Let M dream on with the actions that were really taken, `dreams` times in every episode.
 
     Args:
         latents: z of episodes, float32 (episodes, T, latent_size); M sees the first `awake`.
         actions: float32 (episodes, T, 3).
-        dreams: of every episode.
-        temperature: as for `Mixture.sample`.
 
     Returns:
         z of frames awake, awake + 1, ..., T - 1: float32 (dreams, episodes, T - awake, z).

@@ -28,24 +28,20 @@ def probe(
 
     Args:
         features: (n, features), for example z of every frame.
-        targets: (n, targets), for example the motion of the car.
+        targets: (n, targets), for example the motion of the car; none may be constant.
         episodes: (n,), the episode of each row. Rows of one episode are alike, so episodes are
-            never split.
+            never split; at least 10.
         seed: of the split and of the bootstrap.
         resamples: of the bootstrap over held-out episodes.
 
     Returns:
         "r2" (targets,), "low" and "high" (targets,): its 95% interval.
-
-    Raises:
-        ValueError: unequal numbers of rows, values that are not finite, a constant target, or
-            fewer than 10 episodes.
     """
     check_rows(features, targets, episodes)
     rng = np.random.default_rng(seed)
     names = rng.permutation(np.unique(episodes))
-    heldout = np.isin(episodes, names[: round(HELDOUT * len(names))])
-    others = names[round(HELDOUT * len(names)) :]
+    first, others = np.split(names, [round(HELDOUT * len(names))])
+    heldout = np.isin(episodes, first)
     trial = np.isin(episodes, others[: max(1, round(TRIAL * len(others)))])
     penalties = choose_penalties(features, targets, ~heldout & ~trial, trial)
     predicted = predict(features, targets, ~heldout, penalties, heldout)
@@ -86,10 +82,7 @@ def predict(
 def sums_of_episodes(
     targets: np.ndarray, predicted: np.ndarray, episodes: np.ndarray
 ) -> np.ndarray:
-    """Of every episode what R2 is made of, (episodes, 4, targets).
-
-    Rows, sum, sum of squares, and squared error.
-    """
+    """Rows, sum, sum of squares and squared error of every episode: (episodes, 4, targets)."""
     error = (targets - predicted) ** 2
     parts = np.stack([np.ones_like(targets), targets, targets**2, error], axis=1)
     return np.stack([parts[episodes == one].sum(axis=0) for one in np.unique(episodes)])
@@ -111,9 +104,7 @@ def check_rows(features: np.ndarray, targets: np.ndarray, episodes: np.ndarray) 
     finite = np.isfinite(features).all(axis=1) & np.isfinite(targets).all(axis=1)
     if not finite.all():
         raise ValueError(f"{(~finite).sum()} rows that are not finite: leave those rows out")
-    constant = np.flatnonzero(np.ptp(targets, axis=0) == 0).tolist()
-    if constant:
+    if constant := np.flatnonzero(np.ptp(targets, axis=0) == 0).tolist():
         raise ValueError(f"targets {constant} are constant: leave them out")
-    count = len(np.unique(episodes))
-    if count < FEWEST:
+    if (count := len(np.unique(episodes))) < FEWEST:
         raise ValueError(f"{count} episodes: expected at least {FEWEST}, to fit and to measure on")

@@ -35,14 +35,10 @@ MOTION = {  # the columns of `Trajectory.motion`, with their units
 class Trajectory:
     """One episode of T frames; row t of each array belongs to `observations[t]`."""
 
-    observations: np.ndarray
-    """uint8 (T, 96, 96, 3)."""
-    actions: np.ndarray
-    """float32 (T, 3): the action on that observation."""
-    rewards: np.ndarray
-    """float32 (T,): the reward of that action."""
-    motion: np.ndarray
-    """float32 (T, 6): the columns are the keys of MOTION."""
+    observations: np.ndarray  # uint8 (T, 96, 96, 3)
+    actions: np.ndarray  # on these observations, float32 (T, 3)
+    rewards: np.ndarray  # of these actions, float32 (T,)
+    motion: np.ndarray  # float32 (T, 6): the columns are the keys of MOTION
 
     def __len__(self) -> int:
         return len(self.actions)
@@ -56,8 +52,7 @@ class Recorder:
     """Keeps what a trajectory of one car needs, as `observe` of `rollout`."""
 
     def __init__(self, cars: Cars):
-        self.cars = cars
-        self.rows: list[tuple] = []
+        self.cars, self.rows = cars, []
 
     def __call__(self, _: np.ndarray, seen: np.ndarray, actions: np.ndarray) -> None:
         """Keep one moment."""
@@ -104,10 +99,8 @@ def road_in_sight(motion: np.ndarray) -> np.ndarray:
 
     Elsewhere the picture shows only grass, and no latent could encode where the road is.
     """
-    names = list(MOTION)
-    offset = motion[:, names.index("road offset")]
-    turned = motion[:, names.index("heading error")]
-    return (np.abs(offset) < 3) & (np.abs(turned) < np.pi / 2)
+    columns = dict(zip(MOTION, np.abs(motion).T, strict=True))
+    return (columns["road offset"] < 3) & (columns["heading error"] < np.pi / 2)
 
 
 def record(driver: Driver, cars: Cars, frames: int) -> Trajectory:
@@ -134,20 +127,13 @@ def record_trajectory(agent: Agent, track: int, frames: int) -> Trajectory:
 class Inspection:
     """What V and M make of a trajectory of T frames."""
 
-    frames: np.ndarray
-    """What V saw: uint8 (T, 64, 64, 3)."""
-    differences: np.ndarray
-    """The difference images: float32 (T, 64, 64, 3) in [-1, 1]."""
-    frame_reconstructions: np.ndarray
-    """The frames decoded from mu: uint8 (T, 64, 64, 3)."""
-    difference_reconstructions: np.ndarray | None
-    """float32 (T, 64, 64, 3); None if the variant does not reconstruct them."""
-    mu: np.ndarray
-    """Means of z: float32 (T, latent_size)."""
-    hidden: np.ndarray
-    """M's memory before the frame, which C sees with z: float32 (T, hidden_size)."""
-    mixture: Mixture
-    """M's prediction after the frame and the action: parts (1, T, latent_size, mixtures)."""
+    frames: np.ndarray  # what V saw: uint8 (T, 64, 64, 3)
+    differences: np.ndarray  # float32 (T, 64, 64, 3) in [-1, 1]
+    frame_reconstructions: np.ndarray  # decoded from mu: uint8 (T, 64, 64, 3)
+    difference_reconstructions: np.ndarray | None  # None if V does not reconstruct them
+    mu: np.ndarray  # means of z: float32 (T, latent_size)
+    hidden: np.ndarray  # M's memory before the frame, which C sees with z: float32 (T, hidden_size)
+    mixture: Mixture  # predicted after frame and action: parts (1, T, latent_size, mixtures)
 
 
 def encode_trajectory(
@@ -162,7 +148,7 @@ def inspect_trajectory(world_model: WorldModel, trajectory: Trajectory) -> Inspe
     """Show V and M a trajectory from its first frame on, and keep all that they make of it."""
     vae, mdn_rnn, stride = world_model.vae, world_model.mdn_rnn, world_model.stride
     frames = trajectory.frames(world_model.crop_bar)
-    mu, _ = encode_episode(vae, frames, stride)
+    mu = encode_episode(vae, frames, stride)[0]
     z, actions = torch.from_numpy(mu), torch.from_numpy(trajectory.actions)
     mixture, _ = mdn_rnn(z[None], actions[None])
     decoded, changed = vae.decode(z)

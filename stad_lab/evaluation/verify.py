@@ -23,26 +23,9 @@ from stad_lab.io.weights import (
     load_world_model,
 )
 from stad_lab.io.workers import TaskError, run_in_order, worker_processes, worker_threads
+from stad_lab.training import evolution, pipeline
 from stad_lab.training.dataset import MANIFEST, Dataset, check_seen, count_episodes
-from stad_lab.training.evolution import (
-    LOG,
-    drive_group,
-    hand_out,
-    kept_generation,
-    read_log,
-    resume,
-    validate,
-)
 from stad_lab.training.mdn_rnn import check_mdn_rnn
-from stad_lab.training.pipeline import (
-    GIVE_A_RUN,
-    MACHINE,
-    PACKAGES,
-    RECORD,
-    check_record,
-    provenance,
-    starts,
-)
 
 AGAIN = 3  # recorded episodes that are driven again
 MISSING = "none: trained elsewhere or not yet"
@@ -60,26 +43,33 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         nothing to check, or "differs" if another machine than the recorded one drove otherwise.
 
     Raises:
-        FileNotFoundError: no run in the folder.
-        ValueError: the record itself is damaged.
+        FileNotFoundError, ValueError: no record in the folder, or a damaged one.
     """
     folder = Path(folder)
-    check_record(folder)
-    record = load_json(folder / RECORD, GIVE_A_RUN, kind="record")
+    pipeline.check_record(folder)
+    record = load_json(folder / pipeline.RECORD, pipeline.GIVE_A_RUN, kind="record")
     config = Config.from_dict(record["config"])
-    checks: dict[str, Callable[[], str]] = {
-        "record": lambda: f"ok: {config.variant}",
-        "dataset": lambda: verify_dataset(folder / "dataset"),
-        "V": lambda: verify_vae(folder),
-        "M": lambda: verify_mdn_rnn(folder, config),
-        "log of CMA-ES": lambda: verify_log(folder, config),
-        "C": lambda: verify_controller(folder, config),
-        "evaluations": lambda: verify_evaluations(folder),
-        "episodes": lambda: drive_again(folder, config, executor),
+    dataset, vae = folder / "dataset", folder / VAE_FILE
+    models, log = (VAE_FILE, MDN_RNN_FILE), evolution.LOG
+    checks = {  # name -> the check, and the files without which there is nothing to check
+        "record": (lambda: f"ok: {config.variant}",),
+        "dataset": (lambda: verify_dataset(dataset),),
+        "V": (lambda: check_seen(vae, load_vae(vae)[1]["dataset"], dataset) or "ok", VAE_FILE),
+        "M": (lambda: check_mdn_rnn(config, folder) or "ok", MDN_RNN_FILE),
+        "log of CMA-ES": (lambda: verify_log(folder, config), *models, log),
+        # A C that has lost its V or M fails.
+        "C": (lambda: verify_controller(folder, config), log, CONTROLLER_FILE),
+        "evaluations": (lambda: verify_evaluations(folder),),
+        "episodes": (lambda: drive_again(folder, config, executor), *models, CONTROLLER_FILE),
     }
-    here = provenance("")
-    excuse = "; ".join(filter(None, (other_machine(start, here) for start in starts(record))))
-    return {name: outcome(check, excuse) for name, check in checks.items()}
+    here = pipeline.provenance("")
+    excuses = [other_machine(start, here) for start in pipeline.starts(record)]
+    excuse = "; ".join(filter(None, excuses))
+    found = {}
+    for name, (check, *needed) in checks.items():
+        there = all((folder / file).exists() for file in needed)
+        found[name] = outcome(check, excuse) if there else MISSING
+    return found
 
 
 def outcome(check: Callable[[], str], excuse: str) -> str:
@@ -96,7 +86,7 @@ def other_machine(made_with: dict, here: dict) -> str:
     """In what this machine differs from the recorded one; empty if in nothing."""
     return ", ".join(
         f"{name} is {here[name]!r} and was {made_with.get(name, 'not recorded')!r}"
-        for name in (*MACHINE, *PACKAGES)
+        for name in (*pipeline.MACHINE, *pipeline.PACKAGES)
         if here[name] != made_with.get(name)
     )
 
@@ -112,42 +102,18 @@ def verify_dataset(folder: Path) -> str:
     return f"ok: {len(dataset.frames)} episodes, {len(dataset)} frames"
 
 
-def verify_vae(folder: Path) -> str:
-    """Check V, and that it was trained on this dataset."""
-    path = folder / VAE_FILE
-    if not path.exists():
-        return MISSING
-    check_seen(path, load_vae(path)[1]["dataset"], folder / "dataset")
-    return "ok"
-
-
-def verify_mdn_rnn(folder: Path, config: Config) -> str:
-    """Check M, and that it belongs to V."""
-    if not (folder / MDN_RNN_FILE).exists():
-        return MISSING
-    check_mdn_rnn(config, folder)
-    return "ok"
-
-
-def lacks(folder: Path, *names: str) -> bool:
-    """Whether one of these files, or V or M, is missing."""
-    return not all((folder / name).exists() for name in (VAE_FILE, MDN_RNN_FILE, *names))
-
-
-def longest(folder: Path, config: Config) -> Config:
-    """The configuration with as many generations as the log asks for: a run may be longer now."""
-    asked = load_json(folder / LOG)["evolution"]["generations"]
-    return config.replace(evolution={"generations": asked})
+def logged(folder: Path, config: Config) -> tuple[Config, dict]:
+    """The log of CMA-ES, and the configuration with its generations: a run may be longer now."""
+    asked = load_json(folder / evolution.LOG)["evolution"]["generations"]
+    config = config.replace(evolution={"generations": asked})
+    return config, evolution.read_log(config, folder, load_world_model(folder))
 
 
 def verify_log(folder: Path, config: Config) -> str:
     """Replay the log of CMA-ES: it must give the logged means."""
-    if lacks(folder, LOG):
-        return MISSING
-    config, world_model = longest(folder, config), load_world_model(folder)
-    log = read_log(config, folder, world_model)
+    config, log = logged(folder, config)
     try:
-        resume(config, folder, world_model, log)
+        evolution.resume(config, folder, load_world_model(folder), log)
     except ValueError as error:
         raise NotRepeated(error) from error
     return f"ok: {len(log['generations'])} generations give the same mean"
@@ -155,16 +121,14 @@ def verify_log(folder: Path, config: Config) -> str:
 
 def verify_controller(folder: Path, config: Config) -> str:
     """Check that C is the one with the best validation in the log, and that this is the best."""
-    if not all((folder / name).exists() for name in (LOG, CONTROLLER_FILE)):
-        return MISSING  # but a C that has lost its V or M fails below
-    log = read_log(longest(folder, config), folder, load_world_model(folder))
+    _, log = logged(folder, config)
     validated = [entry for entry in log["generations"] if "validation" in entry]
     best = max(validated, key=lambda entry: entry["validation"]["mean"], default=None)
     expected = best and {
         "generation": best["generation"],
         "validation": float(np.mean(best["validation"]["returns"])),
     }
-    kept = kept_generation(folder, log)
+    kept = evolution.kept_generation(folder, log)
     if log["best"] != expected or best is None or kept != best["generation"]:
         raise ValueError(
             f"{folder / CONTROLLER_FILE} is of generation {kept}, the log names {log['best']}, and"
@@ -186,29 +150,27 @@ def verify_evaluations(folder: Path) -> str:
 
 def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
     """Drive recorded episodes again: of an evaluation, or of the validation that chose C."""
-    if lacks(folder, CONTROLLER_FILE):
-        return MISSING
     parameters, _ = load_controller(folder / CONTROLLER_FILE)
     evaluations = [load_evaluation(file) for file in sorted(folder.glob("evaluation*.json"))]
-    if not evaluations and lacks(folder, LOG):
+    if not evaluations and not (folder / evolution.LOG).exists():
         return MISSING
     official = [one for one in evaluations if one["renderer"] == "gymnasium"]
     workers = worker_processes if official else worker_threads
     with workers(config.processes, executor) as executor:
-        source = hand_out(executor, folder)
+        source = evolution.hand_out(executor, folder)
         if evaluations:
             episodes = [*official, *evaluations][0]["episodes"]
             chosen = np.linspace(0, len(episodes) - 1, min(AGAIN, len(episodes))).astype(int)
             recorded = [episodes[number]["return"] for number in chosen]
             tracks = [[episodes[number]["track"]] for number in chosen]
             tasks = [(source, parameters, track, not official) for track in tracks]
-            found = run_in_order(executor, drive_group, tasks)
+            found = run_in_order(executor, evolution.drive_group, tasks)
             driven = [float(returns[0]) for returns, _ in found]
         else:  # all tracks, because last bits depend on the cars that drive in one batch
-            log = read_log(longest(folder, config), folder, load_world_model(folder))
-            entry = log["generations"][kept_generation(folder, log) - 1]
+            _, log = logged(folder, config)
+            entry = log["generations"][evolution.kept_generation(folder, log) - 1]
             recorded = entry["validation"]["returns"][:AGAIN]
-            driven = validate(executor, source, config, parameters)["returns"][:AGAIN]
+            driven = evolution.validate(executor, source, config, parameters)["returns"][:AGAIN]
     if driven != recorded:
         raise NotRepeated(f"the record says {recorded}, now it was {driven}")
     return f"ok: {', '.join(f'{value:.1f}' for value in driven)} points, bit-identical"
