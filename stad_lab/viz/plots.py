@@ -129,9 +129,8 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
     axis.set(xlabel="true speed (world units per second)", ylabel="mean |d| of the frame")
     axis.legend(frameon=False)
     title = "The difference image grows with speed, and with the stride"
-    return describe(
-        figure, title, "One point for every episode and stride; strides ", map(str, change)
-    )
+    lead = "One point for every episode and stride; strides "
+    return describe(figure, title, lead, map(str, change))
 
 
 def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
@@ -176,21 +175,14 @@ def plot_road(
     (x, y), far = road[center], np.array([-reach, reach])
     axes[0, 1].set(xlim=x + far, ylim=y + far, title=f"around tile {center}")
     axes[0, 1].legend(fontsize=8)
-    lead = (
-        f"A lap of {len(road)} tiles from above, and enlarged around tile {center}: the paths of "
-    )
+    lead = f"A lap of {len(road)} tiles, and enlarged around tile {center}: the paths of "
     return describe(figure, title, lead, paths)
 
 
 def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> Figure:
-    """One moment of an episode: pictures, latents, prediction, action, and the return so far.
+    """Frame `moment` of an episode: pictures, latents, prediction, action, and the return so far.
 
-    Args:
-        inspection: what V and M make of the trajectory.
-        moment: which frame, 0 to len(trajectory) - 1.
-
-    Raises:
-        ValueError: a moment outside the episode.
+    Raises ValueError for a moment outside the episode.
     """
     length = len(trajectory)
     if not 0 <= moment < length:
@@ -218,9 +210,10 @@ def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> 
     weights.imshow(shares, aspect="auto", cmap="cividis", vmin=0, vmax=1, interpolation="nearest")
     weights.set(xlabel="latent", ylabel="Gaussian", yticks=[])
     weights.set_title("M's mixture weights for the next z (yellow: 1)", fontsize=9)
-    action.barh(range(3), trajectory.actions[moment], color=[ORANGE, GREEN, RED])
-    name_rows(action, ["steering", "gas", "brake"])
+    names, colors = ["steering", "gas", "brake"], [ORANGE, GREEN, RED]
+    action.barh(names, trajectory.actions[moment], color=colors)
     action.set(xlim=(-1, 1))
+    action.invert_yaxis()
     action.axvline(0, color="black", lw=0.8)
     reward = below.subplots()
     reward.plot(trajectory.rewards.cumsum(), color=GREEN)
