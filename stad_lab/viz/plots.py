@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from stad_lab.envs.car_racing import TRACK_WIDTH
+from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.evaluation.trajectories import MOTION, Inspection, Trajectory
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -26,7 +27,6 @@ DASHES = ("-", "--", "-.", ":")
 STYLES = [(color, DASHES[(i + turn) % 4]) for turn in range(4) for i, color in enumerate(COLORS)]
 MARKERS = "os^DvP"
 DIFFERENCE_MAP = "PuOr_r"
-SOLVED = 900  # mean return from which Gymnasium calls CarRacing solved
 THIN = {"color": "grey", "lw": 0.8, "ls": ":"}  # a line for reference
 SMALL = {"frameon": False, "fontsize": 9}  # a legend
 

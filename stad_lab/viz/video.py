@@ -57,7 +57,8 @@ def animate_figures(figures: Iterable[Figure], fps: float, kind: str = "gif") ->
 
     Raises ValueError for another kind, or no figures.
     """
-    check_kind(kind)
+    if kind not in ("gif", "webp"):
+        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp', by the file's name too")
     pages = [Image.open(io.BytesIO(to_png(figure))).convert("RGB") for figure in figures]
     if not pages:
         raise ValueError("no figures: expected at least one")
@@ -74,12 +75,6 @@ def save_pages(pages: list[Image.Image], fps: float, kind: str) -> bytes:
 def enlarged(picture: np.ndarray, size: int) -> Image.Image:
     """A square picture, uint8 (H, W, 3), with `size` pixels on each side."""
     return Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST)
-
-
-def check_kind(kind: str) -> None:
-    """Raise ValueError unless `animate_figures` can write this kind of file."""
-    if kind not in ("gif", "webp"):
-        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp', by the file's name too")
 
 
 @torch.no_grad()
@@ -122,7 +117,6 @@ def repeated_dreams(
 
 def film_viewer(agent: Agent, track: int, first: int, frames: int, kind: str = "gif") -> bytes:
     """The trajectory viewer of an agent's episode as an animation: arguments as `film_agent`."""
-    check_kind(kind)
     trajectory = record_longer(agent, track, first, frames)
     inspection = inspect_trajectory(agent.world_model, trajectory)
     return film_trajectory(trajectory, inspection, first, kind)
