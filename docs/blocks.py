@@ -197,10 +197,16 @@ def probe_card(claims: dict, name: str) -> str:
 
 
 def speed_table(claims: dict, key: str, head: str) -> str:
-    """One comparison of the benchmark, slowest first."""
+    """One comparison of the benchmark, slowest first; with the ratio to EnvPool if it took part."""
     found = sorted(claims["speed"][key].items(), key=lambda one: one[1]["median"])
-    lines = [(name, f"{one['median']:,.0f}", f"{one['ratio']:.1f}") for name, one in found]
-    return table((head, "frames a second", "ratio"), lines)
+    pool = max((one["median"] for name, one in found if name.startswith("EnvPool")), default=None)
+    lines = [
+        (name, f"{one['median']:,.0f}", f"{one['ratio']:.1f}")
+        + ((f"{one['median'] / pool:.1f}",) if pool else ())
+        for name, one in found
+    ]
+    heads = (head, "frames a second", "ratio") + (("to EnvPool",) if pool else ())
+    return table(heads, lines)
 
 
 def costs_table(claims: dict) -> str:
@@ -211,14 +217,13 @@ def costs_table(claims: dict) -> str:
 
 
 def training_table(claims: dict) -> str:
-    """The speed of training, with plain PyTorch and with our layers."""
-    lines = []
-    for key, found in claims["speed"].items():
-        if key.startswith("training: ") and " a second" in key:
-            plain, ours = found["plain"]["median"], found["stad_lab"]["median"]
-            name = key.removeprefix("training: ")
-            lines.append((name, f"{plain:,.0f}", f"{ours:,.0f}", f"{ours / plain:.2f}"))
-    return table(("training", "plain PyTorch", "stad_lab", "ratio"), lines)
+    """The speed of training."""
+    found = {
+        key.removeprefix("training: "): one["stad_lab"]["median"]
+        for key, one in claims["speed"].items()
+        if key.startswith("training: ") and " a second" in key
+    }
+    return table(("training", "speed"), [(name, f"{one:,.0f}") for name, one in found.items()])
 
 
 def stages_table(claims: dict) -> str:
@@ -228,13 +233,6 @@ def stages_table(claims: dict) -> str:
               "controller": "CMA-ES", "evaluation": "evaluation", "all": "all"}  # fmt: skip
     lines = [(title, *(f"{one[stage]:.1f}" for one in runs)) for stage, title in stages.items()]
     return table(("stage, minutes", "`laptop`", "`paper`"), lines)
-
-
-def projection_table(claims: dict) -> str:
-    """What a cluster should reach, from measured costs."""
-    found = claims["speed"]["cluster: projected efficiency, 1,024 episodes of 1,000 frames"]
-    lines = sorted(found.items(), key=lambda one: -one[1])
-    return table(("workers", "efficiency"), [(one.split()[0], f"{x:.0%}") for one, x in lines])
 
 
 # The configuration, and the pictures
@@ -320,10 +318,6 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "costs": costs_table,
     "training": training_table,
     "stages": stages_table,
-    "cluster": lambda claims: speed_table(
-        claims, "cluster: frames a second, a generation", "workers"
-    ),
-    "projection": projection_table,
     "commands": commands_table,
     "settings": settings_table,
     "modules": modules_list,

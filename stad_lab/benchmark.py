@@ -212,10 +212,10 @@ def measure_loop(rounds: int) -> dict:
             brief = config.replace(evolution={"cars": cars, "tracks": 2 * cars, "max_frames": 250})
             speed = functools.partial(generation_speed, parameters[None], brief, one, world_model)
             batches[f"{cars} car{'s' * (cars > 1)}"] = speed
-        tables["frames a second, cars in one batch"] = take_turns(batches, rounds, "cars")
+        tables["frames a second, cars in one process"] = take_turns(batches, rounds, "cars")
         budgets = [one.submit(frame_budget, CARS).result() for _ in range(rounds)]
     medians = {part: float(np.median([own[part] for own in budgets])) for part in budgets[0]}
-    return tables | {f"microseconds of a frame, {CARS} cars in one batch": medians}
+    return tables | {f"microseconds of a frame, {CARS} cars in one process": medians}
 
 
 def with_bfloat16(world_model: WorldModel) -> WorldModel:
@@ -274,14 +274,14 @@ def measure_training(rounds: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         config = Config.preset("laptop", variant=SOURCE, data={"episodes": 100})
         collect(config, Path(folder))
-        dataset, contenders = Dataset(Path(folder)), {}
+        dataset, tables = Dataset(Path(folder)), {}
         for width in (16, 32):
             wide = config.replace(vae={"width": width, "steps": V_STEPS})
-            contenders[f"V of width {width}"] = functools.partial(v_speed, wide, dataset)
-        tables = {"images a second": take_turns(contenders, rounds, "V")}
+            one = {"stad_lab": functools.partial(v_speed, wide, dataset)}
+            tables[f"images a second, V of width {width}"] = take_turns(one, rounds, "V")
     paper = Config.preset("paper", mdn_rnn={"steps": M_STEPS})
-    one = {"M at paper settings": functools.partial(m_speed, paper)}
-    return tables | {"frames a second": take_turns(one, rounds, "M")}
+    one = {"stad_lab": functools.partial(m_speed, paper)}
+    return tables | {"frames a second, M at paper settings": take_turns(one, rounds, "M")}
 
 
 def v_speed(config: Config, dataset: Dataset, number: int) -> float:

@@ -179,21 +179,6 @@ def test_a_notebook_has_no_outputs_so_that_a_diff_shows_what_changed(file):
         assert not pictures, f"{cell['id']}: a picture without words"
 
 
-@pytest.mark.parametrize("name", ["instructor", "glossary"])
-def test_every_step_and_figure_that_a_page_names_exists(name):
-    page = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
-    texts = {file.name[:2]: file.read_text(encoding="utf-8") for file in NOTEBOOKS}
-    steps = re.findall(r"\b(0[0-6]), steps? (\d+)(?:(?:, \d+)*(?:,| and) (\d+))?", page)
-    for notebook, *numbers in steps:
-        for number in filter(None, numbers):
-            assert f"## Step {number}. " in texts[notebook], f"{notebook}, step {number}"
-    figures = re.findall(r"\b(0[0-6]), step \d+,(?: exercise \d+,)? \*([^*]+)\*", page)
-    for notebook, title in figures:
-        assert title in texts[notebook], f"{notebook}: {title}"
-    assert len(steps) > 10
-    assert not re.search(r"\b0[0-6]-\d\d\b", page)  # ids of cells
-
-
 def cells_of(file):
     """The cells of a notebook."""
     return json.loads(file.read_text(encoding="utf-8"))["cells"]

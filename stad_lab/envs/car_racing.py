@@ -9,10 +9,10 @@ import numpy as np
 from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
 
-from stad_lab.envs import physics
-from stad_lab.envs.cars import Cars
+from stad_lab.envs import physics, picture
+from stad_lab.envs.cars import Cars, road_polygons
 from stad_lab.envs.frames import OBSERVATION_SHAPE
-from stad_lab.envs.track import KERB_COLORS, TRACK_WIDTH, tile_colors
+from stad_lab.envs.track import TRACK_WIDTH, tile_colors
 
 MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 FAST_ID = "StadLab/CarRacing-v3"
@@ -215,9 +215,9 @@ def road_of(cars: Cars) -> list[tuple]:
     track, road, color = cars.tracks[0], cars.roads[0], cars.colors["road"][0]
     colors = tile_colors(len(track.tiles), color)
     colors[road["darkened"][: len(colors)] > 0] = color
-    tiles = list(zip(track.tiles.tolist(), colors.tolist(), strict=True))
-    kerbs = [
-        (corners, tuple(KERB_COLORS[tile % 2].tolist()))
-        for corners, tile in zip(track.kerbs.tolist(), track.kerb_tiles, strict=True)
+    polygons, kinds = road_polygons(track)
+    kerbs, tiles = {picture.WHITE: (255, 255, 255), picture.RED: (255, 0, 0)}, iter(colors.tolist())
+    return [
+        (corners, kerbs.get(kind) or next(tiles))
+        for corners, kind in zip(polygons.tolist(), kinds.tolist(), strict=True)
     ]
-    return tiles + kerbs

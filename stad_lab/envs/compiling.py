@@ -27,12 +27,11 @@ def compiled(function: Callable | None = None, **options) -> Callable:
     if function is None:
         return lambda function: compiled(function, **options)
     options |= {"nogil": True}
-    for prepare in (bool, use_temporary_folder):
-        prepare()
+    for _ in range(2):
         try:
             return numba.njit(cache=True, **options)(function)
         except RuntimeError:  # Numba found no folder that it can write
-            continue
+            use_temporary_folder()
     return numba.njit(**options)(function)
 
 

@@ -1,19 +1,16 @@
 """Our engine and Gymnasium's own CarRacing-v3 side by side: the same episode in both."""
 
-import gymnasium as gym
 import numpy as np
-from gymnasium.envs.box2d import car_dynamics
 
 from stad_lab.config import track_seeds
-from stad_lab.envs.car_racing import MAX_FRAMES, make_env
+from stad_lab.envs.car_racing import MAX_FRAMES, make_env, place_car
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import to_frame
 from stad_lab.envs.picture import BAR_TOP, HULL_COLUMN, HULL_ROW
-from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.training.dataset import RandomDriver
 
 CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))
-AREAS = ["observation", "window of 24 x 24 around the car", "indicator bar"] + [
+AREAS = ["whole picture", "window of 24 x 24 around the car", "indicator bar"] + [
     f"{frame} against to_frame of {seen} observation"
     for frame in ("cropped frame", "frame")
     for seen in ("our", "Gymnasium's")
@@ -32,7 +29,7 @@ def compare_pictures(number: int, frames: int = MAX_FRAMES) -> tuple[np.ndarray,
     seen, equal, ended = [env.reset(seed=seed)[0] for env in envs], True, False
     if number % 2:
         start = int(rng.integers(10_000)), rng.uniform(0, 90), 0.15 * rng.standard_normal()
-        seen = [envs[0].unwrapped.place(*start), place_car(envs[1], *start)]
+        seen = [place_car(env, *start) for env in envs]
     errors = [compare(cars, *seen)]
     while len(errors) <= frames and not ended:
         action = driver.act()
@@ -52,24 +49,3 @@ def compare(cars: Cars, ours: np.ndarray, theirs: np.ndarray) -> list[float]:
         frame, cars.shows = cars.draw()[0], "observation"
         pairs += [(frame, to_frame(seen, crop_bar=not cars.bar)) for seen in (ours, theirs)]
     return [float(np.abs(one.astype(np.int16) - other).mean()) for one, other in pairs]
-
-
-def place_car(
-    env: gym.Env, tile: int, speed: float = 0.0, turn: float = 0.0, offset: float = 0.0
-) -> np.ndarray:
-    """What `Cars.place` does, in Gymnasium's own environment; returns the observation there."""
-    world = env.unwrapped
-    _, beta, x, y = world.track[tile % len(world.track)]
-    x, y = x + offset * TRACK_WIDTH * np.cos(beta), y + offset * TRACK_WIDTH * np.sin(beta)
-    heading = float(beta + turn)
-    world.car.destroy()
-    world.car = car_dynamics.Car(world.world, heading, float(x), float(y))
-    for wheel, (x, y) in zip(world.car.wheels, car_dynamics.WHEELPOS, strict=True):
-        # Gymnasium's Car places its wheels as if it faced north; a step would jerk them into place.
-        corner = (x * car_dynamics.SIZE, y * car_dynamics.SIZE)
-        wheel.position = world.car.hull.GetWorldPoint(corner)
-        wheel.omega = speed / wheel.wheel_rad
-    for body in world.car.drawlist:
-        body.linearVelocity = (-np.sin(heading) * speed, np.cos(heading) * speed)
-    world.t = max(world.t, 1.0)
-    return world._render("state_pixels")

@@ -13,7 +13,8 @@ from stad_lab.evaluation.statistics import FAILED, SOLVED
 from stad_lab.replication.tables import key
 
 REFERENCES = (  # conditions of `speed` with which the others of their measure are compared
-    "Gymnasium", "Gymnasium alone, no agent, 2 processes", "1 car", "plain", "own processes, 1",
+    "Gymnasium", "Gymnasium alone, no agent, 2 processes", "V + M + C, 1 thread", "1 car", "plain",
+    "own processes, 1", "stad_lab",
 )  # fmt: skip
 
 
@@ -71,8 +72,7 @@ def describe_speed(speed: pandas.DataFrame) -> dict:
     found = {}
     for (part, measure), own in speed.groupby(["part", "measure"]):
         medians = own.groupby("condition")["value"].median().to_dict()
-        for reference in set(REFERENCES) & set(medians):
-            unit = medians[reference]
+        for unit in [medians[name] for name in REFERENCES if name in medians][:1]:
             medians = {name: {"median": m, "ratio": m / unit} for name, m in medians.items()}
         found[f"{part}: {measure}"] = medians
     return found

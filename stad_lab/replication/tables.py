@@ -110,6 +110,25 @@ def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str
     replace_lines("runs", pandas.DataFrame([line]), to)
 
 
+def add_speed(file: Path, to: Path = DATA) -> None:
+    """Add what `python -m stad_lab benchmark` wrote to the tables, in place of the same parts."""
+    result = load_json(file)
+    made_with, parts = result.pop("made_with"), result.keys() - {"rounds"}
+    lines = []
+    for part in parts:
+        for measure, table in result[part].items():
+            for condition, value in table.items():
+                line = {"part": part, "measure": measure, "condition": condition}
+                rounds = value["rounds"] if isinstance(value, dict) else [float(value)]
+                lines += [line | {"round": n, "value": one} for n, one in enumerate(rounds)]
+    old = read("speed", to)
+    save("speed", pandas.concat([old[~old.part.isin(parts)], pandas.DataFrame(lines)]), to)
+    old = read("provenance", to)
+    same = (old.table == "speed") & (old.source == "benchmark")
+    line = {"table": "speed", "source": "benchmark"} | made_with
+    save("provenance", pandas.concat([old[~same], pandas.DataFrame([line])]), to)
+
+
 def check_evaluation(path: Path, found: dict, experiment: str, controller: str | None) -> None:
     """Raise ValueError unless an evaluation is the official one of this experiment's agent."""
     wanted = {"variant": experiment}  # a driver without V sees no picture, of whatever renderer

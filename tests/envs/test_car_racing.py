@@ -1,202 +1,110 @@
-"""The fast environment equals Gymnasium's CarRacing-v3: bit for bit, and nearly in its pictures."""
+"""Our environment for one car equals Gymnasium's CarRacing-v3, and behaves as Gymnasium asks."""
 
 import copy
-import math
+import pickle
 import subprocess
 import sys
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import FrameStackObservation, RecordVideo
 
 from stad_lab import make_env
-from stad_lab.benchmark import compare_pictures
-from stad_lab.envs.car_racing import BAR_TOP, MAX_FRAMES, place_car
+from stad_lab.envs.car_racing import MAX_FRAMES, place_car
+from stad_lab.envs.picture import BAR_TOP
+from stad_lab.evaluation.parity import compare_pictures
+from stad_lab.training.dataset import RandomDriver
 
-STRAIGHT = np.array([0, 1, 0], np.float32)
-
-
-def follow_road(env, speed=45):
-    """Steer to a tile ahead, from the true track."""
-    car, track = env.unwrapped.car, env.unwrapped.track
-    tiles = np.array([tile[2:4] for tile in track])
-    nearest = np.argmin(((tiles - car.hull.position) ** 2).sum(axis=1))
-    dx, dy = tiles[(nearest + 6) % len(tiles)] - car.hull.position
-    cos, sin = math.cos(car.hull.angle), math.sin(car.hull.angle)
-    steering = math.atan2(cos * dx + sin * dy, cos * dy - sin * dx)
-    moving = math.hypot(*car.hull.linearVelocity)
-    return np.array(
-        [np.clip(steering, -1, 1), 0.5 * (moving < speed), 0.3 * (moving > speed + 15)], np.float32
-    )
+GAS = np.array([0, 1, 0], np.float32)
 
 
-def leave_field(env):
-    """Full gas, holding the heading of the start, over grass and off the field."""
-    hull, start = env.unwrapped.car.hull, env.unwrapped.track[0][1]
-    return np.array(
-        [np.clip(3 * (hull.angle - start) + 0.5 * hull.angularVelocity, -1, 1), 1, 0], np.float32
-    )
+def drive_both(actions, seed, **kwargs):
+    """The same episode in both environments: two lists of what `reset` and `step` returned."""
+    found = []
+    for env in (make_env(**kwargs), make_env(fast=False, **kwargs)):
+        steps = [env.reset(seed=seed)]
+        for action in actions:
+            steps.append(env.step(action))
+            if any(steps[-1][2:4]):
+                break
+        found.append(steps)
+        env.close()
+    return found
 
 
-def wild(env):
-    """Whatever the action space has: soon off the road, spinning and sliding."""
-    return env.action_space.sample()
+def assert_close(ours, theirs, limit=1):
+    """Rewards, endings and infos are equal; observations differ by less than `limit` of 255."""
+    assert [step[1:] for step in ours] == [step[1:] for step in theirs]
+    for one, other in zip(ours, theirs, strict=True):
+        assert np.abs(one[0].astype(int) - other[0]).mean() < limit
 
 
-def drive_both(driver, seed, frames=MAX_FRAMES, pictures=True):
-    """Repeat a drive in Gymnasium's environment: two lists of what `step` returned.
-
-    Without pictures Gymnasium's renderer is left out, which is 98% of its time.
-    """
-    steps = []
-    fast, official = make_env(fast=True), make_env(fast=False)
-    fast.action_space.seed(seed)
-    if not pictures:
-        official.unwrapped._render = lambda mode: np.zeros((96, 96, 3), np.uint8)
-    fast.reset(seed=seed)
-    official.reset(seed=seed)
-    for _ in range(frames):
-        action = driver(fast)
-        steps.append((fast.step(action), official.step(action)))
-        if any(steps[-1][0][2:4]) or any(steps[-1][1][2:4]):
-            break
-    fast.close()
-    official.close()
-    return [step[0] for step in steps], [step[1] for step in steps]
+def random_actions(number, count):
+    driver = RandomDriver(np.random.default_rng(number))
+    return [driver.act() for _ in range(count)]
 
 
-@pytest.fixture(scope="module")
-def long_drive():
-    """Four hundred frames on the road, with unmodified Gymnasium."""
-    return drive_both(follow_road, 26, 400)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_random_drive_equals_gymnasium_s(seed):
+    assert_close(*drive_both(random_actions(seed, 60), seed))
 
 
-def assert_bit_identical(fast, official):
-    """Rewards, terminations, truncations and infos."""
-    assert [step[1:] for step in fast] == [step[1:] for step in official]
+def test_discrete_actions_equal_gymnasium_s():
+    actions = np.random.default_rng(0).integers(0, 5, 60).tolist()
+    assert_close(*drive_both(actions, 2, continuous=False))
 
 
-def differences(fast, official, rows=slice(None)):
-    """Mean absolute difference of each pair of pictures."""
-    return [
-        np.abs(a[rows].astype(int) - b[rows].astype(int)).mean()
-        for a, b in zip(fast, official, strict=True)
-    ]
+def test_random_colours_equal_gymnasium_s():
+    ours, theirs = drive_both([GAS] * 30, 3, domain_randomize=True)
+    assert_close(ours, theirs)
+    plain = make_env().reset(seed=3)[0]
+    assert np.abs(plain.astype(int) - ours[0][0]).mean() > 5
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_rewards_bit_identical_on_the_road(seed):
-    fast, official = drive_both(follow_road, seed, 120, pictures=False)
-    assert sum(step[1] for step in fast) > 40  # it was on the road
-    assert_bit_identical(fast, official)
+def test_the_colours_stay_if_a_reset_asks_for_it():
+    env = make_env(domain_randomize=True)
+    colors = []
+    for randomize in (True, False, True):
+        env.reset(options={"randomize": randomize})
+        colors.append(env.unwrapped.cars.colors["road"].copy())
+    assert np.array_equal(colors[0], colors[1])
+    assert not np.array_equal(colors[1], colors[2])
 
 
-@pytest.mark.parametrize("seed", [3, 4, 5])
-def test_rewards_bit_identical_off_the_road(seed):
-    fast, official = drive_both(wild, seed, 120, pictures=False)
-    assert_bit_identical(fast, official)
+def test_an_episode_ends_after_1000_frames_as_gymnasium_s():
+    env = make_env()
+    env.reset(seed=1)
+    ends = [env.step(np.zeros(3, np.float32))[2:4] for _ in range(MAX_FRAMES)]
+    assert ends == [(False, False)] * (MAX_FRAMES - 1) + [(False, True)]
+    assert env.spec.max_episode_steps == make_env(fast=False).spec.max_episode_steps == MAX_FRAMES
 
 
-def test_rewards_bit_identical_in_a_long_episode_of_unmodified_gymnasium(long_drive):
-    fast, official = long_drive
-    assert len(fast) == 400
-    assert_bit_identical(fast, official)
+@pytest.mark.parametrize("number", range(4))
+def test_pictures_and_frames_are_close_to_gymnasium_s(number):
+    errors, equal = compare_pictures(number, frames=20)
+    assert equal
+    assert errors[:, 0].mean() < 0.5
+    assert errors.mean(axis=0).max() < 1.5
 
 
-@pytest.mark.parametrize("seed", [6, 11])
-def test_rewards_bit_identical_off_the_field(seed):
-    fast, official = drive_both(leave_field, seed, pictures=False)
-    assert fast[-1][1:4] == (-100, True, False)
-    assert fast[-1][4] == {"lap_finished": False}
-    assert_bit_identical(fast, official)
-
-
-@pytest.mark.parametrize("driver", [follow_road, wild])
-def test_rewards_bit_identical_to_the_frame_limit(driver):
-    fast, official = drive_both(driver, 1, pictures=False)
-    assert len(fast) == MAX_FRAMES
-    assert fast[-1][2:4] == (False, True)
-    assert_bit_identical(fast, official)
-
-
-def test_rewards_bit_identical_to_the_end_of_a_lap():
-    fast, official = drive_both(lambda env: follow_road(env, speed=60), 1, pictures=False)
-    assert fast[-1][4] == {"lap_finished": True}
-    assert_bit_identical(fast, official)
-
-
-def test_pictures_of_20_episodes_differ_by_half_a_level_and_around_the_car_by_four():
-    episodes = [compare_pictures(number, frames=20) for number in range(20)]
-    assert all(equal for _, equal in episodes)
-    whole, window, bar = np.concatenate([errors for errors, _ in episodes]).mean(axis=0)
-    assert whole <= 0.5
-    assert window <= 4
-    assert bar <= 0.5
-
-
-def test_pictures_differ_by_less_than_one_level_in_the_opening_zoom(long_drive):
-    fast, official = (steps[:50] for steps in long_drive)
-    errors = differences([step[0] for step in fast], [step[0] for step in official])
-    assert max(errors) <= 1
-
-
-@pytest.mark.parametrize("where", ["on the road", "off the road"])
-def test_pictures_differ_by_less_than_one_level_on_average_on_and_off_the_road(where, long_drive):
-    fast, official = long_drive if where == "on the road" else drive_both(wild, 23, 160)
-    assert_bit_identical(fast, official)
-    fast, official = [step[0] for step in fast], [step[0] for step in official]
-    assert np.mean(differences(fast, official)) <= 1
-    assert max(differences(fast, official)) <= 1.5
-    assert np.mean(differences(fast, official, slice(BAR_TOP, None))) <= 1
-    assert max(differences(fast, official, slice(BAR_TOP, None))) <= 1.5
-
-
-def test_pictures_differ_by_less_than_one_level_near_the_edge_of_the_field():
-    fast, official = drive_both(leave_field, 16)
-    assert fast[-1][1:4] == (-100, True, False)
-    assert_bit_identical(fast, official)
-    fast, official = [step[0] for step in fast[-60:]], [step[0] for step in official[-60:]]
-    assert max(differences(fast, official)) <= 1
-
-
-def test_pictures_differ_by_less_than_one_level_after_place_car():
-    fast, official = make_env(fast=True), make_env(fast=False)
-    fast.reset(seed=24)
-    official.reset(seed=24)
-    for tile, speed, turn, offset in [
-        (40, 0, 0, 0),
-        (90, 50, 0.3, 0.6),
-        (180, 90, -1.2, -1.5),
-        (250, 20, 3.0, 0.9),
-    ]:
-        pictures = [[place_car(env, tile, speed, turn, offset)] for env in (fast, official)]
-        for _ in range(5):
-            for env, seen in zip((fast, official), pictures, strict=True):
-                seen.append(env.step(STRAIGHT)[0])
-        assert max(differences(*pictures)) <= 1
-
-
-def test_pictures_differ_by_less_than_one_level_in_random_colours():
-    fast, official = (
-        make_env(fast=True, domain_randomize=True),
-        make_env(fast=False, domain_randomize=True),
-    )
-    plain = make_env(fast=True).reset(seed=25)[0]
-    for options in (None, {"randomize": True}):
-        pictures = [[env.reset(seed=25, options=options)[0]] for env in (fast, official)]
-        for _ in range(30):
-            for env, seen in zip((fast, official), pictures, strict=True):
-                seen.append(env.step(STRAIGHT)[0])
-        assert np.mean(differences(*pictures)) <= 1
-        assert differences([plain], [pictures[0][0]])[0] > 5  # the colours did change
-
-
-def test_visited_tiles_change_colour_as_in_gymnasium(long_drive):
-    behind = (slice(78, BAR_TOP), slice(30, 66))  # road that the car has just passed
-    fast, official = (np.array([step[0][behind] for step in steps[60:100]]) for steps in long_drive)
-    visited = (official == official[0, -1, 20]).all(axis=-1)
-    assert visited.mean() > 0.5
-    assert (fast[visited] == official[visited]).mean() > 0.98
+def test_place_puts_the_car_where_gymnasium_s_would_be():
+    ours, theirs = make_env(), make_env(fast=False)
+    for env in (ours, theirs):
+        env.reset(seed=24)
+    car = ours.unwrapped.cars.cars[0]
+    where = [(40, 0, 0, 0), (90, 50, 0.3, 0.6), (180, 90, -1.2, -1.5), (5000, 20, 3.0, 0.9)]
+    for tile, speed, turn, offset in where:
+        seen = ours.unwrapped.place(tile, speed=speed, turn=turn, offset=offset)
+        other = place_car(theirs, tile, speed, turn, offset)
+        for action in random_actions(tile, 20):
+            assert np.abs(seen.astype(int) - other).mean() < 1
+            steps = [env.step(action) for env in (ours, theirs)]
+            assert steps[0][1:] == steps[1][1:]
+            seen, other = steps[0][0], steps[1][0]
+        bodies = [theirs.unwrapped.car.hull, *theirs.unwrapped.car.wheels]
+        assert np.array_equal(car["position"], np.array([b.position for b in bodies], np.float32))
 
 
 @pytest.mark.parametrize("fast", [True, False])
@@ -204,127 +112,107 @@ def test_check_env_passes(fast):
     check_env(make_env(fast=fast, render_mode="rgb_array").unwrapped)
 
 
-@pytest.mark.parametrize("fast", [True, False])
-def test_spaces_are_those_of_car_racing(fast):
-    env = make_env(fast=fast)
-    observation, _ = env.reset(seed=0)
-    assert observation.shape == (96, 96, 3)
-    assert observation.dtype == np.uint8
-    assert env.observation_space.contains(observation)
-    assert env.action_space.low.tolist() == [-1, 0, 0]
-    assert env.action_space.high.tolist() == [1, 1, 1]
-    assert env.spec.max_episode_steps == MAX_FRAMES
+def test_spaces_are_gymnasium_s():
+    for continuous in (True, False):
+        ours, theirs = (make_env(fast=fast, continuous=continuous) for fast in (True, False))
+        assert ours.observation_space == theirs.observation_space
+        assert ours.action_space == theirs.action_space
+
+
+@pytest.mark.parametrize(("mode", "shape"), [("rgb_array", (400, 600)), ("state_pixels", (96, 96))])
+def test_render_gives_gymnasium_s_window(mode, shape):
+    for seed in (27, 28):
+        envs = [make_env(fast=fast, render_mode=mode) for fast in (True, False)]
+        for env in envs:
+            env.reset(seed=seed)
+            for _ in range(40):
+                env.step(np.array([0.1, 0.4, 0], np.float32))
+        rendered = [env.render() for env in envs]
+        assert rendered[0].shape == (*shape, 3)
+        assert np.array_equal(*rendered)
+        envs[0].reset(seed=seed + 10)  # another track
+        assert not np.array_equal(envs[0].render(), rendered[0])
+
+
+def test_render_with_random_colours_gives_gymnasium_s_window():
+    settings = {"render_mode": "rgb_array", "domain_randomize": True}
+    envs = [make_env(fast=fast, **settings) for fast in (True, False)]
+    for env in envs:
+        env.reset(seed=1)
+    assert np.array_equal(*(env.render() for env in envs))
+
+
+def test_an_episode_can_be_recorded(tmp_path):
+    pytest.importorskip("moviepy")
+    with RecordVideo(make_env(render_mode="rgb_array"), str(tmp_path)) as env:
+        env.reset(seed=0)
+        for _ in range(5):
+            env.step(GAS)
+    assert list(tmp_path.glob("*.mp4"))
+
+
+def test_observations_can_be_stacked():
+    env, plain = FrameStackObservation(make_env(), 4), make_env()
+    env.reset(seed=0)
+    seen = [plain.reset(seed=0)[0], *(plain.step(GAS)[0] for _ in range(5))]
+    for _ in range(5):
+        stacked = env.step(GAS)[0]
+    assert np.array_equal(stacked, seen[-4:])
+
+
+def test_a_seed_gives_the_same_episode_and_none_another_track():
+    env = make_env()
+    first = env.reset(seed=1)[0]
+    second = env.reset()[0]
+    assert not np.array_equal(first, second)
+    assert np.array_equal(env.reset(seed=1)[0], first)
+    assert np.array_equal(env.reset()[0], second)
 
 
 def test_without_the_bar_only_the_bar_is_missing():
-    whole, cropped = make_env(), make_env(bar=False)
-    pictures = [
-        [env.reset(seed=29)[0], *(env.step(STRAIGHT)[0] for _ in range(20))]
-        for env in (whole, cropped)
-    ]
-    for with_bar, without in zip(*pictures, strict=True):
-        assert np.array_equal(with_bar[:BAR_TOP], without[:BAR_TOP])
-        assert with_bar[BAR_TOP:].any()
-        assert not without[BAR_TOP:].any()
+    pairs = zip(
+        *([env.reset(seed=29)[0]] for env in (make_env(), make_env(bar=False))), strict=True
+    )
+    for whole, cropped in pairs:
+        assert np.array_equal(whole[:BAR_TOP], cropped[:BAR_TOP])
+        assert whole[BAR_TOP:].any() and not cropped[BAR_TOP:].any()
 
 
 def test_an_observation_may_be_changed_by_its_receiver():
     env, other = make_env(), make_env()
-    env.reset(seed=30)
+    env.reset(seed=30)[0][:] = 0
     other.reset(seed=30)
     for _ in range(5):
-        observation = env.step(STRAIGHT)[0]
-        assert np.array_equal(observation, other.step(STRAIGHT)[0])
-        observation[:] = 0  # must not reach the pictures that the environment keeps
+        observation = env.step(GAS)[0]
+        assert np.array_equal(observation, other.step(GAS)[0])
+        observation[:] = 0
 
 
-def test_a_closed_environment_holds_no_track_and_can_be_reset_again():
-    env = make_env()
-    first = env.reset(seed=30)[0]
-    env.close()
-    env.close()
-    assert env.unwrapped.road == [] and env.unwrapped.ground.levels == []
-    assert env.unwrapped.world.bodies == []
-    assert np.array_equal(env.reset(seed=30)[0], first)
-
-
-def test_a_copy_is_made_with_the_same_arguments():
-    other = copy.deepcopy(make_env(bar=False, domain_randomize=True).unwrapped)
-    assert other.domain_randomize
-    assert not other.reset(seed=0)[0][BAR_TOP:].any()
-
-
-def test_two_environments_do_not_paint_over_each_other():
-    alone = make_env()
-    expected = [alone.reset(seed=31)[0], *(alone.step(STRAIGHT)[0] for _ in range(60))]
-    one, two = make_env(), make_env()
-    seen = [one.reset(seed=31)[0]]
-    two.reset(seed=32)
-    for _ in range(60):
-        seen.append(one.step(STRAIGHT)[0])
-        two.step(STRAIGHT)
-    assert np.array_equal(seen, expected)
-
-
-def test_render_gives_the_same_large_picture():
-    rendered = []
-    for fast in (True, False):
-        env = make_env(fast=fast, render_mode="rgb_array")
-        env.reset(seed=27)
-        for _ in range(5):
-            env.step(STRAIGHT)
-        rendered.append(env.render())
-    assert rendered[0].shape == (400, 600, 3)
-    assert rendered[0].std() > 10
-    assert np.array_equal(*rendered)
-
-
-def test_a_second_episode_is_drawn_on_its_own_track():
-    env = make_env()
-    first = env.reset(seed=1)[0]
-    other = env.reset(seed=2)[0]
-    assert not np.array_equal(first, other)
-    assert np.array_equal(env.reset(seed=1)[0], first)
-
-
-@pytest.mark.parametrize("fast", [True, False])
-def test_place_car_puts_the_moving_car_on_the_tile(fast):
-    env = make_env(fast=fast)
-    env.reset(seed=28)
-    track = env.unwrapped.track
-    picture = place_car(env, tile=len(track) + 50, speed=40, turn=0.25)
-    _, beta, x, y = track[50]
-    car = env.unwrapped.car
-    assert picture.shape == (96, 96, 3)
-    assert tuple(car.hull.position) == pytest.approx((x, y), abs=1e-3)
-    assert car.hull.angle == pytest.approx(beta + 0.25, abs=1e-5)
-    ahead = (-math.sin(beta + 0.25), math.cos(beta + 0.25))
-    assert tuple(car.hull.linearVelocity) == pytest.approx((40 * ahead[0], 40 * ahead[1]), abs=1e-3)
-    for wheel in car.wheels:
-        assert wheel.omega * wheel.wheel_rad == pytest.approx(40)
-    env.step(np.zeros(3, np.float32))
-    assert math.hypot(*car.hull.linearVelocity) == pytest.approx(40, rel=0.1)
-    assert env.unwrapped.tile_visited_count >= 1
-
-
-def test_place_car_moves_the_car_sideways():
-    env = make_env()
-    env.reset(seed=28)
-    _, beta, x, y = env.unwrapped.track[50]
-    place_car(env, tile=50, offset=1.0)
-    dx, dy = np.array(env.unwrapped.car.hull.position) - (x, y)
-    half_road = 40 / 6
-    assert dx * math.cos(beta) + dy * math.sin(beta) == pytest.approx(half_road, abs=1e-3)
-    assert -dx * math.sin(beta) + dy * math.cos(beta) == pytest.approx(0, abs=1e-3)
-
-
-def test_an_action_that_is_not_finite_is_refused():
+@pytest.mark.parametrize("action", [[0, np.nan, 0], [0, 0], [np.inf, 0, 0], 3])
+def test_an_action_that_is_not_three_finite_numbers_is_refused(action):
     env = make_env()
     env.reset(seed=0)
-    with pytest.raises(
-        ValueError, match=r"action \[.*nan.*\]: expected finite numbers, steering, gas and brake"
-    ):
-        env.step(np.array([0, np.nan, 0]))
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        env.unwrapped.step(np.array(action))
+
+
+def test_a_step_before_the_reset_or_after_close_is_refused():
+    env = make_env().unwrapped
+    with pytest.raises(RuntimeError, match=r"^step before reset: call reset\(\) to begin"):
+        env.step(GAS)
+    env.reset(seed=0)
+    env.close()
+    env.close()
+    for call in (lambda: env.step(GAS), env.reset, env.render):
+        with pytest.raises(RuntimeError, match=r"^the environment is closed: make a new one$"):
+            call()
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_is_made_with_the_same_arguments(again):
+    other = again(make_env(bar=False, domain_randomize=True).unwrapped)
+    assert other.cars.domain_randomize
+    assert not other.reset(seed=0)[0][BAR_TOP:].any()
 
 
 def in_a_fresh_process(code):
@@ -334,20 +222,21 @@ def in_a_fresh_process(code):
     return process.stdout.strip()
 
 
-def test_gymnasium_makes_the_fast_environment_by_its_name_in_a_fresh_process():
+def test_gymnasium_makes_the_environment_by_its_name_in_a_fresh_process():
     code = """
 import gymnasium
 env = gymnasium.make("stad_lab:StadLab/CarRacing-v3", bar=False)
 print(env.reset(seed=1)[0].shape, env.spec.max_episode_steps, type(env.unwrapped).__name__)
 """
-    assert in_a_fresh_process(code) == "(96, 96, 3) 1000 FastCarRacing"
+    assert in_a_fresh_process(code) == "(96, 96, 3) 1000 CarRacing"
 
 
 def test_the_controller_loads_neither_torch_nor_pygame():
     code = """
 import sys
 import stad_lab.models.controller
-print([name for name in ("torch", "pygame", "Box2D", "cv2", "filelock") if name in sys.modules])
+names = ("torch", "pygame", "Box2D", "cv2", "filelock", "numba")
+print([name for name in names if name in sys.modules])
 """
     assert in_a_fresh_process(code) == "[]"
 
@@ -360,3 +249,12 @@ import stad_lab
 print(stad_lab.Config.preset("quick").seed)
 """
     assert in_a_fresh_process(code) == "0"
+
+
+@pytest.mark.long
+def test_stable_baselines3_learns_on_it():
+    sb3 = pytest.importorskip("stable_baselines3")
+    env = gym.wrappers.ResizeObservation(make_env(), (64, 64))
+    model = sb3.PPO("CnnPolicy", env, n_steps=64, batch_size=32, n_epochs=1, device="cpu")
+    model.learn(128)
+    assert model.num_timesteps == 128

@@ -4,14 +4,15 @@ import threading
 
 import numpy as np
 import pytest
-from stad_lab.car_racing import HULL_COLUMN, HULL_ROW, make_env, place_car
-from stad_lab.frames import to_frame
-from stad_lab.rollouts import RandomDriver
 
-from stad_lab.envs import picture
+from stad_lab.envs import physics, picture
+from stad_lab.envs.car_racing import make_env, place_car
+from stad_lab.envs.frames import to_frame
+from stad_lab.envs.track import MAX_TILES
+from stad_lab.evaluation.parity import CAR_WINDOW
+from stad_lab.training.dataset import RandomDriver
 
 BAR_TOP = picture.BAR_TOP
-CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))
 
 
 class Painter:
@@ -19,7 +20,9 @@ class Painter:
 
     def __init__(self, env):
         self.env = env.unwrapped
-        self.ground, self.pictures = picture.make_ground(1), picture.make_pictures()
+        self.ground = picture.make_ground(1)
+        self.cars, self.roads = np.zeros(1, physics.CAR), np.zeros(1, physics.ROAD)
+        self.tiles = np.zeros((1, MAX_TILES, 4, 2))
 
     def paint(self):
         """Paint the environment's track as it was before the car touched a tile."""
@@ -31,28 +34,40 @@ class Painter:
         kinds = np.where(is_tile, shades, np.where(white, picture.WHITE, picture.RED))
         colors = picture.ground_colors(env.bg_color, env.grass_color, env.road_color)
         picture.paint(self.ground, 0, road, kinds.astype(np.uint8), colors)
-        self.tiles, self.visited = road[is_tile], np.zeros(is_tile.sum(), bool)
+        self.roads["tiles"], self.roads["darkened"] = is_tile.sum(), 0
+        self.tiles[0, : is_tile.sum()] = road[is_tile]
 
-    def state(self):
-        """What `draw_picture` wants to know of the car: hull, wheels, reward and time."""
-        car = self.env.car
-        x, y = car.hull.position
-        speed = np.hypot(*car.hull.linearVelocity)
-        hull = np.array([x, y, car.hull.angle, speed, car.hull.angularVelocity])
-        wheels = [(wheel.angle - car.hull.angle, wheel.phase, wheel.omega) for wheel in car.wheels]
-        return hull, np.array(wheels, np.float64), float(self.env.reward), float(self.env.t)
+    def copy_state(self):
+        """Copy what the picture shows of the car and of visited tiles into the records."""
+        env, car, road = self.env, self.cars[0], self.roads[0]
+        bodies = [env.car.hull, *env.car.wheels]
+        car["position"] = [body.position for body in bodies]
+        car["angle"] = [body.angle for body in bodies]
+        car["velocity"][0] = *env.car.hull.linearVelocity, env.car.hull.angularVelocity
+        car["phase"] = [wheel.phase for wheel in env.car.wheels]
+        car["omega"] = [wheel.omega for wheel in env.car.wheels]
+        car["reward"], car["time"] = env.reward, env.t
+        visited = np.array([tile.road_visited for tile in env.road], bool)
+        darkened = road["darkened"][: len(visited)]
+        darkened[visited & (darkened == 0)] = 1
 
     def draw(self, size, bar=True):
         """The observation (size 96) or the agent's frame (size 64) of this moment."""
-        visited = np.array([tile.road_visited for tile in self.env.road], bool)
-        for tile in np.flatnonzero(visited & ~self.visited):
-            picture.visit(self.ground, 0, self.tiles[tile])
-        self.visited = visited
+        self.copy_state()
+        return self.draw_records(size, bar)
+
+    def draw_records(self, size, bar=True):
+        """The same, of the state in the records."""
         out = np.empty((1, size, size, 3), np.uint8)
-        hull, wheels, reward, time = self.state()
-        states = hull[None], wheels[None], np.array([reward]), np.array([time])
-        picture.draw_pictures(out, self.ground, self.pictures, *states, bar)
+        draw(out, self, bar)
         return out[0]
+
+
+def draw(out, painter, bar):
+    """Draw all cars of a painter."""
+    which, pictures = np.arange(len(out)), picture.make_pictures()
+    arrays = painter.cars, painter.roads, painter.tiles
+    picture.draw_cars(out, painter.ground, pictures, which, *arrays, bar)
 
 
 @pytest.fixture(scope="module")
@@ -149,25 +164,34 @@ def test_beyond_the_edge_of_the_field_the_picture_is_black_as_gymnasium_s(painte
 
 @pytest.mark.parametrize("bar", [True, False])
 def test_every_car_of_a_batch_gets_the_picture_it_would_get_alone(painter, bar):
-    painter.env.reset(seed=4)
-    ground, states = picture.make_ground(3), []
+    batch = repeat(painter, 3)
     alone = {size: [] for size in (96, 64)}
     for car, seed in enumerate((4, 5, 6)):
         painter.env.reset(seed=seed)
-        for array, own in zip(ground[:-1], painter.ground[:-1], strict=True):
-            array[car] = own[0]
         for _ in range(10 * car):
             painter.env.step(np.array([0.1, 0.5, 0]))
         for size, pictures in alone.items():
             pictures.append(painter.draw(size, bar))
-        for array, own in zip(ground[:-1], painter.ground[:-1], strict=True):
+        for array, own in zip(arrays_of(batch), arrays_of(painter), strict=True):
             array[car] = own[0]
-        states.append(painter.state())
-    hulls, wheels, rewards, times = (np.array(part) for part in zip(*states, strict=True))
     for size, pictures in alone.items():
         out = np.empty((3, size, size, 3), np.uint8)
-        picture.draw_pictures(out, ground, painter.pictures, hulls, wheels, rewards, times, bar)
+        draw(out, batch, bar)
         assert np.array_equal(out, pictures)
+
+
+def arrays_of(painter):
+    """All arrays with an axis for the cars."""
+    return [*painter.ground[:-1], painter.cars, painter.roads, painter.tiles]
+
+
+def repeat(painter, count):
+    """A painter with copies of a car, each on a ground of its own."""
+    arrays = [np.repeat(array, count, 0) for array in arrays_of(painter)]
+    batch = Painter(painter.env)
+    batch.ground = picture.Ground(*arrays[:-3], painter.ground.pattern)
+    batch.cars, batch.roads, batch.tiles = arrays[-3:]
+    return batch
 
 
 def test_without_the_bar_only_the_bar_is_missing(painter):
@@ -216,7 +240,7 @@ def test_flags_tell_exactly_where_texels_differ_in_kind(painter):
 def test_a_visited_tile_changes_its_shade_and_leaves_kerbs_alone(painter):
     painter.env.reset(seed=11)
     before = painter.ground.texels[0].copy()
-    for tile in painter.tiles:
+    for tile in painter.tiles[0, : painter.roads["tiles"][0]]:
         picture.visit(painter.ground, 0, tile)
     after = painter.ground.texels[0]
     road = (before & picture.KIND) == picture.ROAD
@@ -248,26 +272,21 @@ def test_a_lost_car_gives_a_black_picture(number):
     painter = Painter(make_env(fast=False))
     painter.env.reset(seed=1)
     painter.paint()
-    out, hull = np.empty((1, 96, 96, 3), np.uint8), np.array([[number, number, number, 0, 0]])
-    rest = painter.ground, painter.pictures, hull, np.zeros((1, 4, 3)), np.zeros(1), np.full(1, 2.0)
-    picture.draw_pictures(out, *rest, True)
-    assert not out[0, :60].any()
-    wheels = np.full((1, 4, 3), number)
-    picture.draw_pictures(out, *rest[:3], wheels, np.array([number]), rest[-1], True)
+    painter.copy_state()
+    painter.cars["time"], painter.cars["position"], painter.cars["angle"] = 2.0, number, number
+    assert not painter.draw_records(96)[:60].any()
+    for name in ("phase", "omega", "reward"):
+        painter.cars[name] = number
+    painter.draw_records(96)
 
 
 def test_threads_draw_the_same_pictures(painter):
     painter.env.reset(seed=12)
-    hull, wheels, reward, time = painter.state()
-    states = [np.repeat(np.array(part)[None], 20, 0) for part in (hull, wheels, reward, time)]
-    ground = picture.Ground(
-        *(np.repeat(array, 20, 0) for array in painter.ground[:-1]), painter.ground.pattern
-    )
-    outs = [np.empty((20, 64, 64, 3), np.uint8) for _ in range(4)]
-    arguments = [(out, ground, picture.make_pictures(), *states, True) for out in outs]
-    threads = [threading.Thread(target=picture.draw_pictures, args=args) for args in arguments]
+    expected = painter.draw(64)
+    batch, outs = repeat(painter, 20), [np.empty((20, 64, 64, 3), np.uint8) for _ in range(4)]
+    threads = [threading.Thread(target=draw, args=(out, batch, True)) for out in outs]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert all(np.array_equal(out[i], painter.draw(64)) for out in outs for i in range(20))
+    assert all(np.array_equal(out[i], expected) for out in outs for i in range(20))

@@ -23,7 +23,7 @@ from stad_lab.config import Config
 from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.evaluation.verify import verify, verify_dataset
 from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors, write_bytes
-from stad_lab.io.workers import TaskError, worker_processes
+from stad_lab.io.workers import TaskError
 from stad_lab.training import dataset, evolution, pipeline
 from stad_lab.training.dataset import Dataset
 from stad_lab.training.evolution import evolve
@@ -375,23 +375,6 @@ def test_half_written_files_of_a_killed_process_are_removed_and_those_of_others_
         file.write_bytes(b"{")
     evolve(QUICK, folder, in_this_process)
     assert not left_over.exists() and all(file.exists() for file in others)
-
-
-def test_a_worker_killed_in_the_middle_of_a_generation_costs_only_time(quick_run, tmp_path):
-    folder = start_of("controller", quick_run, tmp_path / "run")
-    with worker_processes(2) as executor, ThreadPoolExecutor(1) as killer:
-
-        def kill_one():
-            deadline = time.time() + 120
-            while not (folder / "evolution.json").exists() and time.time() < deadline:
-                time.sleep(0.01)
-            next(iter(executor.pool._processes.values())).kill()
-
-        done = killer.submit(kill_one)
-        evolve(QUICK, folder, executor)
-        done.result()
-        assert len(executor.lost) == 1
-    assert_equal_results(folder, quick_run, "controller")
 
 
 def test_an_environment_that_raises_stops_the_run_with_its_cause_and_the_run_continues_later(

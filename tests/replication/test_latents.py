@@ -194,7 +194,7 @@ def test_predictions_are_compared_on_the_same_frames_and_on_active_latents():
 
 def test_the_command_probes_a_run_and_keeps_every_r2(quick_run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(latents, "AGENT_FRAMES", 120)
-    monkeypatch.setattr(latents, "worker_processes", lambda count: ThreadPoolExecutor(1))
+    monkeypatch.setattr(latents, "worker_threads", lambda count: ThreadPoolExecutor(1))
     file, before = tmp_path / "probe.json", sorted(quick_run.iterdir())
     command = ["probe", "--run", quick_run, "--episodes", "12", "--json", file]
     assert main([*map(str, command)]) == 0

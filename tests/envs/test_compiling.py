@@ -1,0 +1,126 @@
+"""Compiling the engine: announced once, kept where a folder can be written, safe to do twice."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import stad_lab
+from stad_lab.envs.compiling import NOTICE
+
+# Compiles or loads one function, as the engine does with all of its own.
+SMALL = """
+import numba, sys
+from stad_lab.envs import compiling, track
+import numpy as np
+with compiling.announced():
+    print(track.find_bends(np.zeros((5, 4))).sum())
+    print(track.place_checkpoints(np.zeros((12, 2))).shape)
+print("kept in", track.find_bends.stats.cache_path)
+print("loaded", sum(track.find_bends.stats.cache_hits.values()))
+"""
+ENGINE = """
+from stad_lab.envs.cars import Cars
+cars = Cars(1)
+cars.reset([1])
+print(cars.step([[0, 1, 0]])[0].tobytes().hex(), cars.draw().sum())
+"""
+
+
+def start(code, **environment):
+    """A new Python that runs some code."""
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([sys.executable, "-c", code], env=os.environ | environment, **pipes)
+
+
+def run(code, **environment):
+    """What a new Python prints to stdout and to stderr."""
+    process = start(code, **environment)
+    output, errors = process.communicate(timeout=300)
+    assert process.returncode == 0, errors
+    return output.splitlines(), errors.splitlines()
+
+
+def test_compiling_is_announced_by_one_line_and_loading_by_none(tmp_path):
+    output, errors = run(SMALL, NUMBA_CACHE_DIR=str(tmp_path))
+    assert output[-1] == "loaded 0" and errors == [NOTICE]
+    again, errors = run(SMALL, NUMBA_CACHE_DIR=str(tmp_path))
+    assert again[-1] == "loaded 1" and errors == []
+    assert again[:2] == output[:2] == ["0", "(12, 3)"]
+
+
+# A file in the place of a folder stops every user, root too.
+@pytest.fixture
+def read_only_package(tmp_path):
+    """A folder with a copy of the package in which nothing can be kept."""
+    shutil.copytree(
+        Path(stad_lab.__file__).parent / "envs",
+        tmp_path / "stad_lab" / "envs",
+        ignore=shutil.ignore_patterns("__pycache__"),
+    )
+    (tmp_path / "stad_lab" / "__init__.py").touch()
+    (tmp_path / "stad_lab" / "envs" / "__pycache__").touch()
+    return {"PYTHONPATH": str(tmp_path), "PYTHONSAFEPATH": "1", "NUMBA_CACHE_DIR": ""}
+
+
+def test_a_read_only_package_is_kept_in_the_user_s_cache(read_only_package, tmp_path):
+    home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    for loaded in (0, 1):
+        output, errors = run(SMALL, **read_only_package, **home)
+        assert output[-1] == f"loaded {loaded}" and errors == [NOTICE] * (1 - loaded)
+        assert str(tmp_path) in output[2]
+
+
+def test_without_a_home_a_folder_of_this_user_for_temporary_files_serves(
+    read_only_package, tmp_path
+):
+    home = {"HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null/cache", "TMPDIR": str(tmp_path)}
+    for loaded in (0, 1):
+        output, errors = run(SMALL, **read_only_package, **home)
+        assert output[-1] == f"loaded {loaded}" and errors == [NOTICE] * (1 - loaded)
+    (folder,) = tmp_path.glob("stad_lab-*")
+    assert str(folder) in output[2] and folder.stat().st_mode & 0o077 == 0
+
+
+def test_where_nothing_can_be_written_it_compiles_each_time(read_only_package):
+    home = {"HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null/cache"}
+    code = "import tempfile; tempfile.tempdir = '/dev/null'\n" + SMALL
+    code = code.replace('print("kept', "#").replace('print("loaded', "#")
+    for _ in range(2):
+        output, errors = run(code, **read_only_package, **home)
+        assert output == ["0", "(12, 3)"] and errors == [NOTICE]
+
+
+def test_two_processes_may_compile_at_once(tmp_path):
+    both = [start(SMALL, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
+    for process in both:
+        output, errors = process.communicate(timeout=300)
+        assert process.returncode == 0 and output.startswith("0\n(12, 3)\n")
+        assert errors.splitlines() in ([NOTICE], [])
+    assert run(SMALL, NUMBA_CACHE_DIR=str(tmp_path))[0][-1] == "loaded 1"
+
+
+def test_threads_that_make_the_first_cars_at_once_wait_for_one_compilation():
+    code = """
+from concurrent.futures import ThreadPoolExecutor
+from stad_lab.envs.cars import Cars
+def work(seed):
+    cars = Cars(1)
+    cars.reset([seed])
+    return int(cars.draw().sum())
+with ThreadPoolExecutor(4) as pool:
+    print(len(set(pool.map(work, [1] * 4))))
+"""
+    assert run(code)[0] == ["1"]
+
+
+@pytest.mark.long
+def test_two_processes_may_compile_the_whole_engine_at_once(tmp_path):
+    both = [start(ENGINE, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
+    found = [process.communicate(timeout=600) for process in both]
+    assert found[0][0] == found[1][0] and NOTICE in found[0][1]
+    output, errors = run(ENGINE, NUMBA_CACHE_DIR=str(tmp_path))
+    assert output == found[0][0].splitlines() and errors == []

@@ -1,0 +1,165 @@
+"""The vectorized environment does what Gymnasium's SyncVectorEnv does with single ones."""
+
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from stad_lab.envs.car_racing import make_env
+from stad_lab.envs.picture import BAR_TOP
+from stad_lab.envs.vector import CarRacingVector
+
+CARS, LIMIT = 3, 20  # frames of an episode
+OUTSIDE = (400.0, 0.0)  # world units, beyond the field: the episode ends
+
+
+def make_both(mode, **kwargs):
+    ours = CarRacingVector(CARS, LIMIT, mode, **kwargs)
+    makers = [lambda: make_env(max_episode_steps=LIMIT, **kwargs)] * CARS
+    return ours, SyncVectorEnv(makers, autoreset_mode=mode)
+
+
+def leave_field(envs, car):
+    """Put a car beyond the field."""
+    single = isinstance(envs, SyncVectorEnv)
+    cars = envs.envs[car].unwrapped.cars if single else envs.cars
+    state = cars.cars[0 if single else car]
+    state["position"] += OUTSIDE
+    state["center"] += OUTSIDE
+
+
+def assert_equal(one, other):
+    """What `step` or `reset` returned, with everything in its dicts."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for name in one:
+            assert_equal(one[name], other[name])
+    elif isinstance(one, tuple):
+        for part, same in zip(one, other, strict=True):
+            assert_equal(part, same)
+    elif np.asarray(one).dtype.hasobject:
+        for part, same in zip(one, other, strict=True):
+            assert (part is None) == (same is None)
+            assert part is None or np.array_equal(part, same)
+    else:
+        assert np.array_equal(one, other)
+        assert one.dtype == other.dtype
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("continuous", [True, False])
+def test_it_equals_sync_vector_env_over_ends_of_both_kinds(mode, continuous):
+    both = make_both(mode, continuous=continuous)
+    assert_equal(*(envs.reset(seed=5) for envs in both))
+    both[0].action_space.seed(1)
+    ends = np.zeros(2, int)
+    for step in range(3 * LIMIT):
+        if step in (7, 30):
+            for envs in both:
+                leave_field(envs, step % CARS)
+        actions = both[0].action_space.sample()
+        found = [envs.step(actions) for envs in both]
+        assert_equal(*found)
+        ends += found[0][2].sum(), found[0][3].sum()
+    assert ends[0] == 2 and ends[1] >= 4
+
+
+def test_with_autoreset_off_the_mask_says_who_begins_anew():
+    both = make_both(AutoresetMode.DISABLED)
+    assert_equal(*(envs.reset(seed=6) for envs in both))
+    for _ in range(5):
+        found = [envs.step(np.full((CARS, 3), 0.3, np.float32)) for envs in both]
+    for envs in both:
+        leave_field(envs, 1)
+    found = [envs.step(np.zeros((CARS, 3), np.float32)) for envs in both]
+    assert_equal(*found)
+    assert found[0][2].tolist() == [False, True, False]
+    with pytest.raises(RuntimeError, match=r"cars \[1\]: their episodes have ended, call reset"):
+        both[0].step(np.zeros((CARS, 3), np.float32))
+    mask = np.array([False, True, False])
+    options = [{"reset_mask": mask.copy()} for _ in both]
+    found = [
+        envs.reset(seed=[None, 9, None], options=one)
+        for envs, one in zip(both, options, strict=True)
+    ]
+    assert_equal(found[0][0], found[1][0])
+
+
+@pytest.mark.parametrize("mask", [[False] * CARS, [True]])
+def test_a_mask_that_fits_no_car_is_refused(mask):
+    envs = CarRacingVector(CARS, autoreset_mode="Disabled")
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match="reset_mask"):
+        envs.reset(options={"reset_mask": np.array(mask)})
+
+
+def test_seeds_count_up_from_one_number_or_are_given_for_each_car():
+    envs = CarRacingVector(CARS)
+    one, several = envs.reset(seed=4)[0], envs.reset(seed=[4, 5, 6])[0]
+    assert np.array_equal(one, several)
+    assert np.array_equal(one[2], make_env().reset(seed=6)[0])
+    assert not np.array_equal(envs.reset()[0], one)
+    with pytest.raises(ValueError, match="2 seeds: expected 3, one for each car"):
+        envs.reset(seed=[1, 2])
+
+
+def test_a_step_before_the_reset_begins_episodes_or_is_refused():
+    zeros = np.zeros((CARS, 3), np.float32)
+    with pytest.raises(RuntimeError, match="call reset"):
+        CarRacingVector(CARS, autoreset_mode="SameStep").step(zeros)
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"num_envs": 0}, {"max_episode_steps": 0}, {"render_mode": "rgb_array"}]
+)
+def test_impossible_settings_are_refused(arguments):
+    with pytest.raises(ValueError, match="expected at least 1, at least 1, and None"):
+        CarRacingVector(**arguments)
+
+
+def test_an_action_that_is_not_finite_is_refused():
+    envs = CarRacingVector(CARS)
+    envs.reset(seed=0)
+    with pytest.raises(ValueError, match="expected finite numbers"):
+        envs.step(np.full((CARS, 3), np.nan))
+
+
+def test_close_gives_the_tracks_back_and_may_come_twice():
+    envs = CarRacingVector(CARS)
+    envs.reset(seed=0)
+    envs.close()
+    envs.close()
+    assert envs.cars is None and envs.closed
+
+
+def test_without_the_bar_only_the_bar_is_missing():
+    whole, cropped = (CarRacingVector(2, bar=bar).reset(seed=0)[0] for bar in (True, False))
+    assert np.array_equal(whole[:, :BAR_TOP], cropped[:, :BAR_TOP])
+    assert whole[:, BAR_TOP:].any() and not cropped[:, BAR_TOP:].any()
+
+
+def test_vector_wrappers_of_gymnasium_work_on_it():
+    envs = gym.wrappers.vector.RecordEpisodeStatistics(CarRacingVector(2, LIMIT))
+    envs.reset(seed=0)
+    for _ in range(LIMIT):
+        info = envs.step(envs.action_space.sample())[-1]
+    assert info["episode"]["l"].tolist() == [LIMIT] * 2
+
+
+def test_make_vec_finds_it_by_its_name_in_a_fresh_process():
+    code = """
+import gymnasium
+envs = gymnasium.make_vec(
+    "stad_lab:StadLab/CarRacing-v3", num_envs=4, vectorization_mode="vector_entry_point",
+    autoreset_mode="SameStep",
+)
+print(type(envs).__name__, envs.reset(seed=1)[0].shape, envs.metadata["autoreset_mode"].value)
+print(envs.spec.id, envs.max_episode_steps, envs.num_envs)
+"""
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
+    expected = ["CarRacingVector (4, 96, 96, 3) SameStep", "StadLab/CarRacing-v3 1000 4"]
+    assert process.stdout.splitlines() == expected
