@@ -8,11 +8,11 @@ import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from figures import CONDITIONS, plot_forest, signed
 from gallery import CELLS, PICTURES
 from PIL import Image
 
 from stad_lab import cli, config
+from stad_lab.viz.replication import CONDITIONS, plot_forest, signed
 
 PACKAGE = Path(config.__file__).parent
 PRETRAINED = PACKAGE / "pretrained"

@@ -13,8 +13,9 @@ import sys
 from pathlib import Path
 
 from blocks import BLOCKS, NUMBERS, forest
-from figures import to_png
 from gallery import PICTURES
+
+from stad_lab.viz.plots import to_png
 
 ROOT = Path(__file__).parent.parent
 CLAIMS = ROOT / "stad_lab" / "replication" / "data" / "claims.json"

@@ -1,8 +1,6 @@
 """The doctor: is everything here that the notebooks need, and what to do about what is not.
 
-It must run where things are broken, so until a library has been looked at, only the standard
-library is imported. `python -m stad_lab check` prints the report; in a notebook,
-`check_environment()` at the end of a cell shows it.
+It must run where things are broken, so a check imports what it needs by itself.
 """
 
 import contextlib
@@ -37,6 +35,11 @@ class Line:
     remedy: str = ""
 
 
+def judge(good: bool, name: str, found: str, remedy: str, bad: str = RED) -> Line:
+    """A green line, or one of the state `bad` with its remedy."""
+    return Line(GREEN, name, found) if good else Line(bad, name, found, remedy)
+
+
 @dataclass(frozen=True)
 class Report:
     """All lines; prints as text in a terminal, and as a table in a notebook."""
@@ -57,12 +60,11 @@ class Report:
         return f"{counted}: {'everything needed is here' if self.ok else advice}"
 
     def __str__(self) -> str:
-        width = max(len(line.name) for line in self.lines)
-        texts = [
-            f"{line.state:6s} {line.name:{width}s}  {line.found}"
-            + (f"\n{'':{width + 7}s}  remedy: {line.remedy}" if line.remedy else "")
-            for line in self.lines
-        ]
+        width, texts = max(len(line.name) for line in self.lines), []
+        for line in self.lines:
+            texts.append(f"{line.state:6s} {line.name:{width}s}  {line.found}")
+            if line.remedy:
+                texts.append(f"{'':{width + 7}s}  remedy: {line.remedy}")
         return "\n".join([*texts, self.summary])
 
     __repr__ = __str__
@@ -126,23 +128,18 @@ def check_packages() -> Iterator[Line]:
         marker, name = requirement.marker, requirement.name
         found = installed_version(name)
         if not marker or marker.evaluate({"extra": ""}):
-            if found is None:
-                yield Line(RED, name, f"missing for {sys.executable}", INSTALL)
-            else:
-                yield compare(name, found, str(requirement.specifier), INSTALL)
+            yield compare(name, found, str(requirement.specifier), INSTALL)
         elif found is None or not requirement.specifier.contains(found, prereleases=True):
             for extra in extras:
                 if marker.evaluate({"extra": extra}):
                     extras[extra].append(f"{name} ({found or 'missing'})")
     for extra, lacking in extras.items():
+        found = f"incomplete: {', '.join(lacking)}" if lacking else "complete"
         remedy = f"only if you need this extra: pip install 'stad_lab[{extra}]'"
-        state = Line(AMBER, f"extra {extra}", f"incomplete: {', '.join(lacking)}", remedy)
-        yield state if lacking else Line(GREEN, f"extra {extra}", "complete")
+        yield judge(not lacking, f"extra {extra}", found, remedy, AMBER)
     if found := installed_version("box2d-py"):
-        remedy = f"pip uninstall box2d-py box2d, then {INSTALL}"
-        yield Line(
-            RED, "box2d-py", f"{found}, which overwrites the module `Box2D` of box2d", remedy
-        )
+        found += ", which overwrites the module `Box2D` of box2d"
+        yield Line(RED, "box2d-py", found, f"pip uninstall box2d-py box2d, then {INSTALL}")
 
 
 def installed_version(name: str) -> str | None:
@@ -151,13 +148,14 @@ def installed_version(name: str) -> str | None:
         return version(name)
 
 
-def compare(name: str, found: str, wanted: str, remedy: str) -> Line:
+def compare(name: str, found: str | None, wanted: str, remedy: str) -> Line:
     """A line on a version: green if `found` fulfils `wanted`, for example ">=1.2,<2"."""
     from packaging.specifiers import SpecifierSet
 
-    if SpecifierSet(wanted).contains(found, prereleases=True):
-        return Line(GREEN, name, found)
-    return Line(RED, name, f"{found}, but stad_lab needs {wanted}", remedy)
+    if found is None:
+        return Line(RED, name, f"missing for {sys.executable}", remedy)
+    good = SpecifierSet(wanted).contains(found, prereleases=True)
+    return judge(good, name, found if good else f"{found}, but stad_lab needs {wanted}", remedy)
 
 
 def check_imports() -> Iterator[Line]:
@@ -193,11 +191,9 @@ def check_weights() -> Iterator[Line]:
     # A pointer of Git LFS, or an incomplete download:
     small = [f"{file.parent.name}/{file.name}" for file in files if file.stat().st_size < 500]
     size = sum(file.stat().st_size for file in files) / 1e6
-    if files and not small:
-        yield Line(GREEN, "weights", f"{len(files)} files, {size:.0f} MB")
-    else:
-        found = f"truncated: {', '.join(small)}" if small else "none in stad_lab/pretrained"
-        yield Line(RED, "weights", found, "download or clone the whole of stad_lab again")
+    found = f"truncated: {', '.join(small)}" if small else f"{len(files)} files, {size:.0f} MB"
+    remedy = "download or clone the whole of stad_lab again"
+    yield judge(bool(files) and not small, "weights", found, remedy)
 
 
 def check_drive() -> Iterator[Line]:
@@ -215,7 +211,7 @@ def check_drive() -> Iterator[Line]:
         colors = len(np.unique(observation.reshape(-1, 3), axis=0))
         found = f"picture {observation.shape}, {colors} colours, mean {observation.mean():.0f}"
         black = observation.mean() < 10 or colors < 5
-        yield Line(RED, name, f"{found}: black", remedy) if black else Line(GREEN, name, found)
+        yield judge(not black, name, f"{found}: black" if black else found, remedy)
 
 
 def check_processors() -> Iterator[Line]:
@@ -232,10 +228,9 @@ def check_processors() -> Iterator[Line]:
     elif allowed < cores and not threads:  # PyTorch would start as many threads as cores
         remedy = f"set OMP_NUM_THREADS={allowed} before you start JupyterLab"
         yield Line(AMBER, "cores", f"{cores}, of which the container may use {allowed}", remedy)
-    elif cores == 1:
-        yield Line(AMBER, "cores", "1", "all works, more slowly: add --processes 1 to train")
     else:
-        yield Line(GREEN, "cores", f"{cores}")
+        remedy = "all works, more slowly: add --processes 1 to train"
+        yield judge(cores > 1, "cores", f"{cores}", remedy, AMBER)
 
 
 def check_memory() -> Iterator[Line]:
@@ -271,8 +266,7 @@ def check_folder(folder: Path) -> Iterator[Line]:
 
 def graded(name: str, found: float, amber: float, red: float, remedy: str) -> Line:
     """A line on gigabytes: green from `amber` on, red below `red`."""
-    state = GREEN if found >= amber else AMBER if found >= red else RED
-    return Line(state, name, f"{found:.1f} GB", "" if state == GREEN else remedy)
+    return judge(found >= amber, name, f"{found:.1f} GB", remedy, AMBER if found >= red else RED)
 
 
 def check_gpu() -> Iterator[Line]:
@@ -300,8 +294,7 @@ def check_widgets() -> Iterator[Line]:
     from jupyter_core.paths import jupyter_path
 
     folders = [Path(folder, "@jupyter-widgets") for folder in jupyter_path("labextensions")]
-    if any((folder / "jupyterlab-manager").exists() for folder in folders):
-        yield Line(GREEN, "widgets", f"jupyterlab_widgets {version('jupyterlab_widgets')}")
-    else:
-        remedy = "pip install --force-reinstall jupyterlab_widgets, then start JupyterLab again"
-        yield Line(AMBER, "widgets", "jupyterlab_widgets is missing: no slider is shown", remedy)
+    good = any((folder / "jupyterlab-manager").exists() for folder in folders)
+    found = version("jupyterlab_widgets") if good else "is missing: no slider is shown"
+    remedy = "pip install --force-reinstall jupyterlab_widgets, then start JupyterLab again"
+    yield judge(good, "widgets", f"jupyterlab_widgets {found}", remedy, AMBER)

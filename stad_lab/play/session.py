@@ -1,8 +1,8 @@
 """A session at the wheel: on the real track or in the dream, driven by keys or by the agent.
 
-A session has no clock and no window: its caller sets the pace with `step` (the widget, a script, a
-test). On the real track the agent sees every frame and M remembers every action, also while the
-human drives. So the agent can take over at any frame, and a dream can begin at any frame.
+It has no clock and no window: the caller sets the pace with `step`. On the real track the agent
+sees every frame and M remembers every action, also while the human drives. So the agent can take
+over at any frame, and a dream can begin at any frame.
 """
 
 from collections import deque
@@ -39,24 +39,23 @@ def on_one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-class Hand:
-    """Keys as a driver. Keys are binary and steering is continuous, so the action is smoothed.
+def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    """Raise ValueError unless a value is one of the choices."""
+    if value not in choices:
+        raise ValueError(f"{name} {value!r}: expected one of {', '.join(choices)}")
 
-    Attributes:
-        held: which of PEDALS are down.
-        action: the last action, float32 (3,): steering in [-1, 1], gas in [0, 0.7], brake in
-            [0, 0.8]; after an agent, gas and brake may begin with up to 1.
-    """
+
+class Hand:
+    """Keys as a driver. Keys are binary and steering is continuous, so the action is smoothed."""
 
     def __init__(self):
-        self.held: set[str] = set()
-        self.action = np.zeros(3, np.float32)
+        self.held: set[str] = set()  # which of PEDALS are down
+        self.action = np.zeros(3, np.float32)  # the last one, which may be an agent's
 
     def hold(self, *pedals: str) -> None:
         """Hold these of PEDALS and release all others. ValueError for another name."""
         for pedal in pedals:
-            if pedal not in PEDALS:
-                raise ValueError(f"pedal {pedal!r}: expected some of {', '.join(PEDALS)}")
+            check_choice("pedal", pedal, PEDALS)
         self.held = set(pedals)
 
     def act(self) -> np.ndarray:
@@ -91,9 +90,7 @@ class Session:
         score: return of the real episode so far.
         earlier: the last four episodes before this one, as (track, Trajectory), newest last.
 
-    Args:
-        agent: the trained agent; the session changes its memory, so give it one of its own.
-        track: seed of the first track.
+    The session changes the memory of its agent, so give it one of its own.
     """
 
     def __init__(self, agent: Agent, track: int = 1):
@@ -127,15 +124,13 @@ class Session:
 
     def give(self, driver: str) -> None:
         """Let "hand" or "agent" drive (ValueError for others), from the last action on."""
-        if driver not in DRIVERS:
-            raise ValueError(f"driver {driver!r}: expected one of {', '.join(DRIVERS)}")
+        check_choice("driver", driver, DRIVERS)
         self.driver = driver
 
     @on_one_thread()
     def enter(self, world: str) -> None:
         """Continue on the "real" track, or in a new "dream" of its frame; else ValueError."""
-        if world not in WORLDS:
-            raise ValueError(f"world {world!r}: expected one of {', '.join(WORLDS)}")
+        check_choice("world", world, WORLDS)
         if world == "dream":
             options = {"latents": self.agent.latents[0], "state": self.before}
             self.latents, _ = self.dream.reset(seed=self.track, options=options)
@@ -190,9 +185,10 @@ class Session:
         self.latents, _, _, self.dream_ended, _ = self.dream.step(action)
 
     def _act(self, driver: str, proposed: np.ndarray) -> np.ndarray:
-        if driver == "agent":
-            self.hand.action = proposed.copy()
-        return proposed if driver == "agent" else self.hand.act()
+        if driver == "hand":
+            return self.hand.act()
+        self.hand.action = proposed.copy()
+        return proposed
 
     def _observe(self) -> None:
         """Show the agent the present observation, and keep M's memory from before it."""

@@ -1,7 +1,7 @@
 """The driving widget: a `Session` with keys, buttons and a moving picture. Needs a running kernel.
 
-The loop is a thread of the kernel, so other cells run while the car drives. keys.js, which runs in
-the page, decides which keys belong to the game, and sends the pedals that are held.
+The loop is a thread of the kernel, so other cells run while the car drives. keys.js, in the page,
+sends the pedals that are held.
 """
 
 import html
@@ -133,11 +133,8 @@ class Seat:
         self.driver.value = self.session.driver
 
     def drive(self, on: bool) -> None:
-        """Start the loop, or pause it. Any other seat's loop is stopped.
-
-        When an episode ends by itself, the game keeps the keys: one that is still held would be a
-        command of JupyterLab.
-        """
+        """Start the loop, or pause it. Any other seat's loop is stopped."""
+        # After the end of an episode the game keeps the keys: JupyterLab would obey a held one.
         if not self.session.ended:
             (self.view.add_class if on else self.view.remove_class)("stad-lab-driving")
         if on:

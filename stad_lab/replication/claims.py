@@ -1,7 +1,7 @@
-"""Every statistic that a page shows, computed from the tables and written to one file.
+"""Every statistic that a page shows, computed from the tables and written to `data/claims.json`.
 
-`python -m stad_lab claims` renews `data/claims.json` after a run was added; pages and figures take
-their numbers from there. Scores are returns of CarRacing; intervals are [low, high], of 95%.
+`python -m stad_lab claims` renews that file after a run was added. Scores are returns of CarRacing;
+intervals are [low, high], of 95%.
 """
 
 import json
@@ -85,17 +85,17 @@ def compare_recipe(returns: dict[str, np.ndarray], recipe: str) -> dict:
     scores = [returns[f"{recipe}_{variant}"] for variant in VARIANTS]
     runs = [own.mean(axis=1) for own in scores]
     found = {"about": RECIPES[recipe]}
-    for place, variant in enumerate(VARIANTS):
+    for place, (variant, own) in enumerate(zip(VARIANTS, scores, strict=True)):
         found[variant] = {
-            "mean": float(scores[place].mean()),
-            "bootstrap_interval_of_mean": statistics.bootstrap(scores[place]),
+            "mean": float(own.mean()),
+            "bootstrap_interval_of_mean": statistics.bootstrap(own),
             "runs": runs[place].tolist(),
         }
         if variant != "frame":
             found[variant] |= {
-                "difference": float(scores[place].mean() - scores[0].mean()),
+                "difference": float(own.mean() - scores[0].mean()),
                 "interval": statistics.pooled_interval(runs, 0, place),
-                "bootstrap_interval": statistics.bootstrap_difference(scores[0], scores[place]),
+                "bootstrap_interval": statistics.bootstrap_difference(scores[0], own),
                 "welch_p": statistics.welch_p(runs[0], runs[place]),
                 "difference_by_seed": (runs[place] - runs[0]).tolist(),
             }
@@ -153,13 +153,11 @@ def learning_curve(
     """All episodes driven so far, and score, at each validation of a run: arrays (validations,)."""
     named = f"experiment == {experiment!r} and role == 'run' and seed == {seed}"
     run, log = runs.query(named).iloc[0], generations.query(named)
-    population, tracks, validations = (
-        run[f"config.evolution.{name}"] for name in ("population", "tracks", "validation_tracks")
-    )
+    settings = run.filter(like="config.evolution.").rename(lambda name: name.split(".")[-1])
     own = run["budget.evolution.episodes"] + run["budget.validation.episodes"]
     validated = log["validation.mean"].notna()
-    driven = run["total.episodes"] - own + log["generation"] * population * tracks
-    driven += validated.cumsum() * validations
+    driven = run["total.episodes"] - own + log["generation"] * settings.population * settings.tracks
+    driven += validated.cumsum() * settings.validation_tracks
     return driven[validated].to_numpy(np.int64), log["validation.mean"][validated].to_numpy()
 
 

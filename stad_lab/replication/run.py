@@ -52,13 +52,8 @@ def replicate(
 ) -> dict:
     """Run what is missing of an experiment in `folder/name`; returns the summary of its returns.
 
-    Args:
-        name: one of EXPERIMENTS or BASELINE_DRIVERS.
-        executor: who drives; None for processes of this machine.
-        seeds: of a baseline driver there are none.
-
-    Raises:
-        ValueError: an unknown experiment or seed, or a folder with something else in it.
+    `executor` drives; None for processes of this machine. Raises ValueError for an unknown
+    experiment or seed, and for a folder with something else in it.
     """
     own = Path(folder) / name
     if is_baseline(name, seeds):
@@ -185,21 +180,21 @@ def keep(name: str, folder: str | Path, seeds: Seeds = None, to: Path = tables.D
 def describe_time(name: str, seeds: Seeds = None) -> str:
     """One line on how long an experiment took us, with everything that it builds on."""
     if is_baseline(name, seeds):
-        hours = recorded_hours(name, 1)
+        minutes = recorded_minutes(name, 1)
     else:
         experiment = find_experiment(name, seeds)
-        hours = recorded_hours(name, len(experiment.seeds))
-        hours += recorded_hours(experiment.base, len(experiment.seeds))
-        hours += recorded_hours(experiment.world_model, 0)
-    return f"{name}: about {60 * hours:.0f} minutes with two processes, if nothing of it is there"
+        minutes = recorded_minutes(name, len(experiment.seeds))
+        minutes += recorded_minutes(experiment.base, len(experiment.seeds))
+        minutes += recorded_minutes(experiment.world_model, 0)
+    return f"{name}: about {minutes:.0f} minutes with two processes, if nothing of it is there"
 
 
-def recorded_hours(name: str | None, runs: int) -> float:
+def recorded_minutes(name: str | None, runs: int) -> float:
     """How long so many runs of an experiment took us, with the training of a shared V and M."""
     table = tables.read("runs").query("experiment == @name")
     seconds = table.filter(like="seconds.").sum(axis=1)
     own = table["role"] == "run"
-    return (seconds[~own].sum() + runs * seconds[own].mean()) / 3600 if own.any() else 0.0
+    return (seconds[~own].sum() + runs * seconds[own].mean()) / 60 if own.any() else 0.0
 
 
 def describe(name: str, found: dict) -> str:

@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from stad_lab.envs.car_racing import TRACK_WIDTH
+from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.evaluation.trajectories import MOTION, Inspection, Trajectory
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
@@ -23,13 +24,11 @@ PURPLE, SKY = "#CC79A7", "#56B4E9"
 COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
 DASHES = ("-", "--", "-.", ":")
 # Lines differ in more than colour: to colour-blind readers GREEN and PURPLE are two greys.
-STYLES = tuple(
-    (color, DASHES[(place + turn) % 4]) for turn in range(4) for place, color in enumerate(COLORS)
-)
+STYLES = [(color, DASHES[(i + turn) % 4]) for turn in range(4) for i, color in enumerate(COLORS)]
 MARKERS = "os^DvP"
 DIFFERENCE_MAP = "PuOr_r"
-SOLVED = 900  # mean return from which Gymnasium calls CarRacing solved
 THIN = {"color": "grey", "lw": 0.8, "ls": ":"}  # a line for reference
+SMALL = {"frameon": False, "fontsize": 9}  # a legend
 
 
 def new_figure(
@@ -40,10 +39,10 @@ def new_figure(
     return figure, figure.subplots(rows, columns, squeeze=False, **kwargs)
 
 
-def describe(figure: Figure, title: str, content: str) -> Figure:
-    """Give a Figure its title and its alternative text."""
+def describe(figure: Figure, title: str, lead: str, values: Iterable[str] = ()) -> Figure:
+    """Give a Figure its title, and an alternative text: the title, `lead` and all `values`."""
     figure.suptitle(title, fontsize=11)
-    figure.set_label(f"{title}. {content}.")
+    figure.set_label(f"{title}. {lead}{', '.join(values)}.")
     return figure
 
 
@@ -66,14 +65,9 @@ def name_rows(axis: Axes, names: Iterable[str]) -> None:
     axis.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.5, -0.5))
 
 
-def legend_below(figure: Figure, axis: Axes, series: dict[str, tuple[str, str]] | None) -> None:
-    """A legend below the figure: of name -> (marker, colour), or of all that an axis shows."""
-    handles, names = axis.get_legend_handles_labels()
-    if series:
-        names = list(series)
-        handles = [axis.plot([], [], marker, color=color)[0] for marker, color in series.values()]
-    place = {"loc": "outside lower center", "ncols": 4, "frameon": False, "fontsize": 9}
-    figure.legend(handles, names, **place)
+def legend_below(figure: Figure, axis: Axes) -> None:
+    """A legend below the figure, of all that an axis names."""
+    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4, **SMALL)
 
 
 def to_png(figure: Figure) -> bytes:
@@ -98,8 +92,8 @@ def plot_pictures(
     """Pictures in a grid.
 
     Args:
-        rows: each a list of pictures: uint8 (H, W, 3), or difference images float (H, W, 3) in
-            [-1, 1], shown as their mean over the colours on one scale; None leaves a gap.
+        rows: lists of pictures: uint8 (H, W, 3), or difference images float (H, W, 3), shown as
+            their mean over the colours on one scale; None leaves a gap.
         columns: titles of the columns.
         names: of the rows; "" for none.
     """
@@ -122,17 +116,12 @@ def plot_pictures(
         caption(axis, column)
     if drawn is not None:
         figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label="difference d")
-    content = f"Rows: {', '.join(filter(None, names)) or 'one'}; columns: {', '.join(columns)}"
-    return describe(figure, title, content)
+    lead = f"Rows: {', '.join(filter(None, names)) or 'one'}; columns: "
+    return describe(figure, title, lead, columns)
 
 
 def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
-    """How much of the picture changes at which speed.
-
-    Args:
-        speed: of the car in every episode, world units per second.
-        change: stride -> mean `|d|` at the end of every episode.
-    """
+    """The car's speed at the end of every episode, and for each stride the mean `|d|` there."""
     figure, ((axis,),) = new_figure(6.5, 3.6)
     for (stride, values), color in zip(change.items(), cycle(COLORS), strict=False):
         label = f"stride {stride}: correlation {np.corrcoef(speed, values)[0, 1]:.2f}"
@@ -140,31 +129,25 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
     axis.set(xlabel="true speed (world units per second)", ylabel="mean |d| of the frame")
     axis.legend(frameon=False)
     title = "The difference image grows with speed, and with the stride"
-    strides = ", ".join(map(str, change))
-    return describe(figure, title, f"One point for every episode and stride; strides {strides}")
+    lead = "One point for every episode and stride; strides "
+    return describe(figure, title, lead, map(str, change))
 
 
 def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
-    """Driven paths from above, a panel for each.
-
-    Args:
-        paths: name -> (points (T, 2), whether the human drove, bool (T,)).
-    """
+    """Driven paths from above: name -> (points (T, 2), whether the human drove, bool (T,))."""
     figure, axes = new_figure(max(3.4 * len(paths), 5.0), 3.9, 1, len(paths))
     for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
-        for driver, shown, style in (
-            ("agent", ~by_hand, {"color": BLUE, "s": 4}),
-            ("human", by_hand, {"color": ORANGE, "s": 12}),
-        ):
+        drivers = ("agent", ~by_hand, BLUE, 4), ("human", by_hand, ORANGE, 12)
+        for driver, shown, color, size in drivers:
             if shown.any():
-                axis.scatter(*points[shown].T, label=driver, **style)
+                axis.scatter(*points[shown].T, label=driver, color=color, s=size)
         axis.plot(*points[0], "^", color="black", ms=9, label="start")
         caption(axis, name, "world units, to the right of the start")
         axis.set_aspect("equal", adjustable="datalim")  # panels of one size
         axis.legend(frameon=False, fontsize=8)
     axes[0, 0].set_ylabel("world units, ahead of the start")
     ends = [f"{name}: {len(own)} frames, {own.sum()} by hand" for name, (_, own) in paths.items()]
-    return describe(figure, title, f"The car's path from above. {', '.join(ends)}")
+    return describe(figure, title, "The car's path from above. ", ends)
 
 
 def plot_road(
@@ -192,19 +175,14 @@ def plot_road(
     (x, y), far = road[center], np.array([-reach, reach])
     axes[0, 1].set(xlim=x + far, ylim=y + far, title=f"around tile {center}")
     axes[0, 1].legend(fontsize=8)
-    panels = f"A lap of {len(road)} tiles from above, and enlarged around tile {center}"
-    return describe(figure, title, f"{panels}: the paths of {', '.join(paths)}")
+    lead = f"A lap of {len(road)} tiles, and enlarged around tile {center}: the paths of "
+    return describe(figure, title, lead, paths)
 
 
 def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> Figure:
-    """One moment of an episode: pictures, latents, prediction, action, and the return so far.
+    """Frame `moment` of an episode: pictures, latents, prediction, action, and the return so far.
 
-    Args:
-        inspection: what V and M make of the trajectory.
-        moment: which frame, 0 to len(trajectory) - 1.
-
-    Raises:
-        ValueError: a moment outside the episode.
+    Raises ValueError for a moment outside the episode.
     """
     length = len(trajectory)
     if not 0 <= moment < length:
@@ -253,10 +231,10 @@ def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> 
 def plot_history(history: list[dict], title: str, unit: str) -> Figure:
     """Training and held-out loss against the training step, from a training's history."""
     steps = np.array([entry["step"] for entry in history])
-    losses = {
-        name: np.array([entry[key]["total"] for entry in history])
-        for name, key in (("train", "train"), ("held-out", "heldout"))
-    }
+    train, heldout = (
+        np.array([entry[data]["total"] for entry in history]) for data in ("train", "heldout")
+    )
+    losses = {"train": train, "held-out": heldout}
     return plot_curves(losses, title, "training step", f"loss ({unit})", x=steps, marker=".")
 
 
@@ -268,7 +246,7 @@ def plot_bars(values: dict[str, np.ndarray], title: str, xlabel: str, ylabel: st
         caption(axis, name, xlabel)
     axes[0, 0].set_ylabel(ylabel)
     ranges = [f"{name} from {max(own):.3g} to {min(own):.3g}" for name, own in values.items()]
-    return describe(figure, title, f"Bars sorted from high to low: {', '.join(ranges)}")
+    return describe(figure, title, "Bars sorted from high to low: ", ranges)
 
 
 def plot_rate_distortion(
@@ -277,13 +255,14 @@ def plot_rate_distortion(
     """Rate (KL, nats) against distortion (squared error), a named point for each V."""
     figure, ((axis,),) = new_figure(6.5, 3.4)
     axis.plot(rates, errors, "o-", color=BLUE)
-    points = list(zip(names, rates, errors, strict=True))
-    for name, *place in points:
-        axis.annotate(name, place, xytext=(6, 6), textcoords="offset points", fontsize=9)
     axis.set(xlabel="rate: KL (nats)", ylabel="distortion: squared error")
     axis.margins(0.18)
-    named = [f"{name} {rate:.0f} nats, {error:.0f}" for name, rate, error in points]
-    return describe(figure, title, f"Points: {', '.join(named)}")
+    values = []
+    for name, rate, error in zip(names, rates, errors, strict=True):
+        place = {"xytext": (6, 6), "textcoords": "offset points"}
+        axis.annotate(name, (rate, error), fontsize=9, **place)
+        values.append(f"{name} {rate:.0f} nats, {error:.0f}")
+    return describe(figure, title, "Points: ", values)
 
 
 def plot_scatter(
@@ -306,7 +285,7 @@ def plot_scatter(
         figure.colorbar(drawn, ax=axis, shrink=0.9, label=MOTION.get(name, ""))
     axes[0, 0].set_ylabel(ylabel)
     counts = [f"{name} ({len(x)} points)" for name, (x, _) in panels.items()]
-    return describe(figure, title, f"Panels: {', '.join(counts)}")
+    return describe(figure, title, "Panels: ", counts)
 
 
 def plot_mixture(
@@ -333,9 +312,8 @@ def plot_mixture(
         axis.axvline(actual, color=RED, ls="--", lw=1.5, label="actual value")
     axis.set(xlabel="next value of the latent", ylabel="probability density", ylim=(0, None))
     axis.legend(frameon=False)
-    chosen = ", ".join(f"{temperature:g}" for temperature in temperatures)
-    title = "M's prediction for one latent"
-    return describe(figure, title, f"Density of the mixture at temperature {chosen}")
+    lead, chosen = "Density of the mixture at temperature ", (f"{one:g}" for one in temperatures)
+    return describe(figure, "M's prediction for one latent", lead, chosen)
 
 
 def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> Figure:
@@ -349,12 +327,10 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
         axis.stairs(share * len(share), edges, color=color, ls=dash, lw=1.8, label=name)
     axis.axhline(1, color="black", lw=1, ls="--", label="uniform")
     axis.set(xlabel=xlabel, ylabel="density", ylim=(0, None))
-    axis.legend(frameon=False, fontsize=9)
-    ranges = [
-        f"{name} {min(own) * len(own):.2g} to {max(own) * len(own):.2g}"
-        for name, own in shares.items()
-    ]
-    return describe(figure, title, f"Histograms relative to uniform, 1: {', '.join(ranges)}")
+    axis.legend(**SMALL)
+    scaled = {name: share * len(share) for name, share in shares.items()}
+    ranges = [f"{name} {min(own):.2g} to {max(own):.2g}" for name, own in scaled.items()]
+    return describe(figure, title, "Histograms relative to uniform, 1: ", ranges)
 
 
 # CMA-ES
@@ -378,8 +354,7 @@ def plot_cma_es(
     dots = {"s": 16, "color": ORANGE, "edgecolor": "black", "lw": 0.4, "zorder": 3}
     outline = {"fill": False, "ec": SKY, "lw": 2.5, "zorder": 4}
     for index, axis in zip(shown, axes[0], strict=True):
-        generation = generations[index]
-        mean = generation["mean"]
+        generation, mean = generations[index], generations[index]["mean"]
         axis.contourf(x, x, np.log(height - height.min() + 1e-2), 18, cmap="Greys_r", alpha=0.8)
         axis.scatter(*generation["population"].T, **dots)
         values, vectors = np.linalg.eigh(generation["covariance"])
@@ -391,19 +366,16 @@ def plot_cma_es(
         caption(axis, f"generation {index + 1}", "x")
     axes[0, 0].set_ylabel("y")
     title = "Population (dots), mean (cross) and one-sigma ellipse of CMA-ES"
-    numbers = ", ".join(str(index + 1) for index in shown)
-    describe(figure, title, f"Generations {numbers}")
+    describe(figure, title, "Generations ", (str(index + 1) for index in shown))
     if len(shown) < 3:
         figure.suptitle("Population, mean, ellipse", fontsize=11)  # for a narrow figure
     return figure
 
 
 def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str) -> Figure:
-    """Worst, average and best fitness against the generation.
+    """Worst, average and best fitness of each generation: (3, generations), of `fitness_curves`.
 
-    Args:
-        curves: (3, generations), from `evolution.fitness_curves`.
-        validation: generation -> mean return of C on the validation tracks.
+    `validation`: generation -> mean return of C on the validation tracks.
     """
     figure, ((axis,),) = new_figure(7.0, 3.8)
     generation = np.arange(1, curves.shape[1] + 1)
@@ -416,39 +388,9 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
     axis.axhline(SOLVED, **THIN)
     axis.set(xlabel="generation", ylabel="fitness: mean return over the tracks")
     axis.set_ylim(min(-60, curves.min() - 20), 1000)
-    axis.legend(frameon=False, fontsize=9)
-    worst, average, best = curves[:, -1]
-    last = f"worst {worst:.0f}, average {average:.0f}, best {best:.0f}"
-    return describe(figure, title, f"In the last of {curves.shape[1]} generations: {last}")
-
-
-def plot_seeds(runs: dict[str, np.ndarray], title: str, window: int = 5) -> Figure:
-    """Worst, average and best agent against the generation, with seeds as bands.
-
-    Args:
-        runs: name -> (seeds, 3, generations), for each seed `evolution.fitness_curves`. A line is
-            the mean over the seeds, its band goes from the lowest to the highest.
-        window: generations of the running mean, at most all of a run.
-    """
-    figure, axes = new_figure(11.0, 3.9, 1, 3, sharey=True)
-    for panel, (axis, name) in enumerate(zip(axes[0], ("worst", "average", "best"), strict=True)):
-        for (label, curves), (color, dash) in zip(runs.items(), cycle(STYLES), strict=False):
-            width = min(window, curves.shape[2])
-            mean = np.full(width, 1 / width)
-            smooth = np.apply_along_axis(np.convolve, 1, curves[:, panel], mean, "valid")
-            generation = np.arange(smooth.shape[1]) + (width + 1) / 2
-            axis.plot(generation, smooth.mean(axis=0), dash, color=color, lw=1.6, label=label)
-            axis.plot(generation, smooth.T, color=color, lw=0.7, alpha=0.5)
-            band = smooth.min(axis=0), smooth.max(axis=0)
-            axis.fill_between(generation, *band, color=color, alpha=0.1, lw=0)
-        axis.axhline(SOLVED, **THIN)
-        caption(axis, f"{name} agent of a generation", "generation")
-    window = min([window, *(curves.shape[2] for curves in runs.values())])
-    axes[0, 0].set_ylabel(f"fitness, mean of {window} generations")
-    legend_below(figure, axes[0, 0], None)
-    last = [f"{name} {curves[:, 1, -window:].mean():.0f}" for name, curves in runs.items()]
-    content = f"Average agent of the last {window} generations, mean of the seeds"
-    return describe(figure, title, f"{content}: {', '.join(last)}")
+    axis.legend(**SMALL)
+    last = [f"{name} {value:.0f}" for name, value in zip(names, curves[:, -1], strict=True)]
+    return describe(figure, title, f"In the last of {curves.shape[1]} generations: ", last)
 
 
 def plot_episodes(
@@ -463,18 +405,18 @@ def plot_episodes(
         published: name -> episodes -> score, as others have reported: points without a line.
     """
     figure, ((axis,),) = new_figure(8.0, 4.2 + 0.08 * len(runs))
+    last = []
     for (name, seeds), (color, dash) in zip(runs.items(), cycle(STYLES), strict=False):
-        for seed, (episodes, scores) in enumerate(seeds):
-            label = name if seed == 0 else None
-            axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8, label=label)
+        for episodes, scores in seeds:
+            (line,) = axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8)
+        line.set_label(name)
+        last.append(f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}")
     for (name, points), marker in zip(published.items(), MARKERS, strict=False):
         axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
     axis.axhline(SOLVED, **THIN)
     axis.set(xscale="log", xlabel="episodes (logarithmic)", ylabel="score", ylim=(None, 960))
-    legend_below(figure, axis, None)  # inside the axis, many names would hide the points
-    means = {name: np.mean([scores[-1] for _, scores in seeds]) for name, seeds in runs.items()}
-    last = ", ".join(f"{name} {mean:.0f}" for name, mean in means.items())
-    return describe(figure, title, f"At the end, mean of the seeds: {last}")
+    legend_below(figure, axis)  # inside the axis, many names would hide the points
+    return describe(figure, title, "At the end, mean of the seeds: ", last)
 
 
 # Results
@@ -504,46 +446,43 @@ def plot_curves(
         axis.plot(places, values, dash, color=color, label=name, marker=shape)
     axis.set(xlabel=xlabel, ylabel=ylabel, **axis_settings)
     beside = {"loc": "center left", "bbox_to_anchor": (1, 0.5)} if many else {}
-    axis.legend(frameon=False, fontsize=9, **beside)
+    axis.legend(**SMALL, **beside)
     ends = [f"{name} from {own[0]:.3g} to {own[-1]:.3g}" for name, own in curves.items()]
-    return describe(figure, title, f"Lines: {', '.join(ends)}")
+    return describe(figure, title, "Lines: ", ends)
 
 
 def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
     """Every episode's return as a dot, a row for each name, with the mean as a bar."""
     figure, ((axis,),) = new_figure(7.0, 0.8 * len(returns) + 1.4)
-    rng = np.random.default_rng(0)
+    rng, text = np.random.default_rng(0), {"va": "center", "fontsize": 9}
     for row, (values, color) in enumerate(zip(returns.values(), cycle(COLORS), strict=False)):
-        jitter, mean = rng.uniform(-0.22, 0.22, len(values)), values.mean()
-        axis.scatter(values, row + jitter, s=12, color=color, alpha=0.6)
+        mean = values.mean()
+        axis.scatter(values, row + rng.uniform(-0.22, 0.22, len(values)), 12, color, alpha=0.6)
         axis.plot([mean] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
-        place = {"transform": axis.get_yaxis_transform(), "va": "center", "fontsize": 9}
-        axis.text(1.01, row, f"mean {mean:.0f}", **place)
+        axis.text(1.01, row, f"mean {mean:.0f}", transform=axis.get_yaxis_transform(), **text)
     axis.axvline(SOLVED, **THIN)
     axis.set_xlabel("return of an episode")
     name_rows(axis, returns)
-    means = [f"{name} mean {values.mean():.0f}" for name, values in returns.items()]
-    return describe(figure, title, ", ".join(means))
+    means = (f"{name} mean {values.mean():.0f}" for name, values in returns.items())
+    return describe(figure, title, "", means)
 
 
 def plot_stacks(stacks: dict[str, dict[str, float]], title: str, xlabel: str) -> Figure:
     """Stacked bars: name -> part -> value."""
     figure, ((axis,),) = new_figure(7.5, 0.42 * len(stacks) + 1.5)
-    for place, parts in enumerate(stacks.values()):
+    sums = []
+    for place, (name, parts) in enumerate(stacks.items()):
         left = 0.0
         for (part, value), color in zip(parts.items(), cycle(COLORS), strict=False):
             label = part if place == 0 else None
             axis.barh(place, value, left=left, color=color, height=0.6, label=label)
             left += value
         axis.text(left, place, f" {left:.0f}", va="center", fontsize=9)
+        sums.append(f"{name}: {', '.join(f'{part} {value:.0f}' for part, value in parts.items())}")
     axis.set_xlabel(xlabel)
     name_rows(axis, stacks)
     axis.margins(x=0.1)
-    axis.legend(frameon=False, fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3)
-    sums = [
-        f"{name}: {', '.join(f'{part} {value:.0f}' for part, value in parts.items())}"
-        for name, parts in stacks.items()
-    ]
+    axis.legend(**SMALL, loc="lower center", bbox_to_anchor=(0.5, 1), ncols=3)
     return describe(figure, title, "; ".join(sums))
 
 
@@ -553,7 +492,6 @@ def plot_intervals(
     xlabel: str,
     columns: int = 3,
     limits: tuple[float, float] | None = None,
-    sharex: bool = True,
 ) -> Figure:
     """Values with their intervals, in panels, rows and series of their own colour and mark.
 
@@ -563,15 +501,16 @@ def plot_intervals(
         columns: panels beside each other.
         limits: of the common horizontal axis; an arrow at the edge marks a value further left.
     """
-    rows, contents = list(next(iter(panels.values()))), []
-    for found in panels.values():
-        contents += found.values()
-    names = list(dict.fromkeys(name for row in contents for name in row))
+    rows = list(next(iter(panels.values())))
+    contents = [series for found in panels.values() for series in found.values()]
+    names = list(dict.fromkeys(name for series in contents for name in series))
     shifts = np.linspace(-0.25, 0.25, len(names)) if len(names) > 1 else [0]
     styles = dict(zip(names, zip(cycle("oDs^vP"), cycle(COLORS), shifts), strict=False))
     lines, width = -(-len(panels) // columns), 2.0 + 2.5 * columns if columns > 1 else 6.5
     height = lines * (max(0.32, 0.11 * len(names)) * len(rows) + 0.75) + 0.7  # inches
-    figure, axes = new_figure(width, height, lines, columns, sharex=sharex, sharey=True)
+    figure, axes = new_figure(width, height, lines, columns, sharex=True, sharey=True)
+    # Nobody would listen to a longer alternative text.
+    read, values = names if sum(map(len, contents)) <= 40 else names[:1], []
     for axis, (panel, found) in zip(axes.flat, panels.items(), strict=False):
         for (place, row), name in product(enumerate(rows), names):
             if name not in found[row]:
@@ -582,8 +521,10 @@ def plot_intervals(
             x, mark = (limits[0], "<") if outside else (value, mark)
             axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.5)
             axis.plot(x, y, mark, color=color, ms=5, clip_on=not outside)
-            for values in single:
-                axis.plot(values, [y] * len(values), "|", color=color, ms=8, mew=1.5)
+            for places in single:
+                axis.plot(places, [y] * len(places), "|", color=color, ms=8, mew=1.5)
+            if name in read:
+                values.append(" ".join(filter(None, (panel, row, name, f"{value:.3g}"))))
         name_rows(axis, rows)
         axis.grid(axis="x", color="0.9")
         axis.set_title(panel, fontsize=9)
@@ -592,32 +533,7 @@ def plot_intervals(
     if limits:  # a limit that is set no longer grows with later panels
         axes[0, 0].set_xlim(limits)
     if len(names) > 1:
-        legend_below(figure, axes[0, 0], {name: styles[name][:2] for name in names})
-    # Nobody would listen to a longer alternative text.
-    read = names if sum(map(len, contents)) <= 40 else names[:1]
-    values = [
-        " ".join(filter(None, (panel, row, name, f"{found[row][name][0]:.3g}")))
-        for panel, found in panels.items()
-        for row, name in product(rows, read)
-        if name in found[row]
-    ]
-    return describe(figure, title, "; ".join(values))
-
-
-def plot_claims(scores: dict[str, dict[str, tuple[float, list[float], list[float]]]]) -> Figure:
-    """The paper's score of each variant beside ours, and enlarged from 870 to 930.
-
-    Args:
-        scores: variant -> condition -> (mean, [low, high], means of the CMA-ES runs or []). A
-            variant may lack some conditions.
-    """
-    title = "Mean return on 100 tracks: the paper's, and ours with 95% intervals and CMA-ES runs"
-    panels = {"all": scores, "enlarged": scores}
-    figure = plot_intervals(panels, title, "return", columns=2, sharex=False)
-    figure.axes[1].set_xlim(870, 930)
-    values = []
-    for variant, found in scores.items():
-        for name, (mean, _, runs) in found.items():
-            single = f" (CMA-ES runs {', '.join(f'{own:.0f}' for own in runs)})" if runs else ""
-            values.append(f"{variant} {name} {mean:.0f}{single}")
+        for name, (mark, color, _) in styles.items():
+            axes[0, 0].plot([], [], mark, color=color, label=name)
+        legend_below(figure, axes[0, 0])
     return describe(figure, title, "; ".join(values))

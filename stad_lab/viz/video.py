@@ -27,14 +27,9 @@ DREAM = 100  # frames of an open-loop dream: two seconds
 
 
 def animate_pictures(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
-    """An animated GIF of pictures side by side.
+    """An animated GIF of square pictures side by side: title -> uint8 (frames, H, H, 3).
 
-    Args:
-        columns: title -> pictures, uint8 (frames, H, W, 3), square; all of one length.
-        fps: pictures per second.
-
-    Raises:
-        ValueError: no pictures, or columns of different lengths.
+    Raises ValueError for no pictures, or columns of different lengths.
     """
     lengths = {title: len(pictures) for title, pictures in columns.items()}
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
@@ -44,7 +39,8 @@ def animate_pictures(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
     for pictures in zip(*columns.values(), strict=True):
         page = Image.new("RGB", (len(columns) * (size + gap) - gap, size + header), "white")
         draw = ImageDraw.Draw(page)
-        for left, title, picture in zip(range(0, 10**6, size + gap), columns, pictures):  # noqa: B905
+        for place, (title, picture) in enumerate(zip(columns, pictures, strict=True)):
+            left = place * (size + gap)
             draw.text((left + size / 2, header / 2), title, fill="black", font=font, anchor="mm")
             page.paste(enlarged(picture, size), (left, header))
         pages.append(page)
@@ -57,15 +53,12 @@ def animate_pictures(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
 
 
 def animate_figures(figures: Iterable[Figure], fps: float, kind: str = "gif") -> bytes:
-    """Figures of one size as an animation.
+    """Figures of one size as an animation: "gif", or "webp", which is sharper and smaller.
 
-    Args:
-        kind: "gif", or "webp", which is sharper and smaller.
-
-    Raises:
-        ValueError: another kind, or no figures.
+    Raises ValueError for another kind, or no figures.
     """
-    check_kind(kind)
+    if kind not in ("gif", "webp"):
+        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp', by the file's name too")
     pages = [Image.open(io.BytesIO(to_png(figure))).convert("RGB") for figure in figures]
     if not pages:
         raise ValueError("no figures: expected at least one")
@@ -84,23 +77,12 @@ def enlarged(picture: np.ndarray, size: int) -> Image.Image:
     return Image.fromarray(picture).resize((size, size), Image.Resampling.NEAREST)
 
 
-def check_kind(kind: str) -> None:
-    """Raise ValueError unless `animate_figures` can write this kind of file."""
-    if kind not in ("gif", "webp"):
-        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp', by the file's name too")
-
-
 @torch.no_grad()
 def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
     """An animated GIF of observation, difference image, reconstruction and dream.
 
-    Args:
-        track: seed of the track.
-        first: first frame to show.
-        frames: number of frames to cover.
-
-    Raises:
-        ValueError: the episode ends before `first`, or a number that is out of range.
+    It covers `frames` frames from `first` on. Raises ValueError if the episode ends before `first`,
+    or for a number that is out of range.
     """
     trajectory, world_model = record_longer(agent, track, first, frames), agent.world_model
     seen, shown = trajectory.frames(world_model.crop_bar), slice(first, None, EVERY)
@@ -119,10 +101,9 @@ def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
 def repeated_dreams(
     agent: Agent, trajectory: Trajectory, first: int, length: int = DREAM
 ) -> np.ndarray:
-    """Dreams of `length` frames, each from where its own trajectory then is.
+    """Dreams of `length` frames, each from where the trajectory then is.
 
-    Returns:
-        A picture for each frame from `first` on, uint8 (len(trajectory) - first, 64, 64, 3).
+    Returns a picture for each frame from `first` on, uint8 (len(trajectory) - first, 64, 64, 3).
     """
     agent.reset()
     dreams = []
@@ -135,19 +116,10 @@ def repeated_dreams(
 
 
 def film_viewer(agent: Agent, track: int, first: int, frames: int, kind: str = "gif") -> bytes:
-    """The trajectory viewer of an agent's episode, as an animation.
-
-    Args:
-        kind: "gif" or "webp"; the others as for `film_agent`.
-
-    Raises:
-        ValueError: as `film_agent`, or another kind.
-    """
-    check_kind(kind)
+    """The trajectory viewer of an agent's episode as an animation: arguments as `film_agent`."""
     trajectory = record_longer(agent, track, first, frames)
-    return film_trajectory(
-        trajectory, inspect_trajectory(agent.world_model, trajectory), first, kind
-    )
+    inspection = inspect_trajectory(agent.world_model, trajectory)
+    return film_trajectory(trajectory, inspection, first, kind)
 
 
 def film_trajectory(
@@ -165,7 +137,6 @@ def record_longer(agent: Agent, track: int, first: int, frames: int) -> Trajecto
         if value < least:
             raise ValueError(f"{name}={value}: expected at least {least}")
     trajectory = record_trajectory(agent, track, first + frames)
-    if len(trajectory) <= first:
-        ends = f"on track {track} the episode ends after {len(trajectory)} frames"
-        raise ValueError(f"first={first}, but {ends}")
+    if (length := len(trajectory)) <= first:
+        raise ValueError(f"first={first}: on track {track} the episode ends after {length} frames")
     return trajectory

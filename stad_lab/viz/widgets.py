@@ -35,11 +35,7 @@ def show_animation(gif: bytes, alt: str) -> HTML:
 
 
 def show_picture(content: bytes, kind: str, alt: str) -> HTML:
-    """A picture as HTML: as a bare picture it would lose its alternative text on a page.
-
-    Raises:
-        ValueError: no alternative text.
-    """
+    """A picture as HTML, which keeps its alternative text; ValueError if there is none."""
     if not alt.strip():
         raise ValueError(f"alt={alt!r}: expected a text; a figure has one after set_label")
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
@@ -58,12 +54,7 @@ def show_source(*things: Callable) -> HTML:
 
 
 def explore(draw: Callable[..., Figure], **controls: ipywidgets.Widget) -> ipywidgets.VBox:
-    """Controls above a figure, which is drawn again whenever one of them changes.
-
-    Args:
-        draw: takes the controls' values by name, returns a Figure.
-        **controls: widgets with a `value`.
-    """
+    """Controls above the figure that `draw` returns for their values, whenever one changes."""
     picture = ipywidgets.HTML()
 
     def update(_change=None) -> None:
@@ -83,9 +74,8 @@ def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]]
     and the same cell run again continues from there.
 
     Args:
-        train: is given the function to call with the entries so far: the `watch` of
-            `evolution.evolve` and of `train_vae`.
-        draw: entries -> Figure.
+        train: is given the `watch` of `evolution.evolve` or `train_vae`.
+        draw: entries of the log so far -> Figure.
 
     Returns:
         False if it was interrupted, True if the training is complete.
@@ -116,11 +106,7 @@ def view_trajectory(trajectory: Trajectory, inspection: Inspection) -> ipywidget
 
 
 def explore_latents(vae: VAE, z: np.ndarray) -> ipywidgets.VBox:
-    """One slider for each latent, and the frame (and difference image) that V decodes from them.
-
-    Args:
-        z: where the sliders begin, float32 (latent_size,).
-    """
+    """A slider for each latent, which begins at z (latent_size,), and what V decodes from them."""
     pictures = [ipywidgets.HTML() for _ in range(1 + vae.reconstructs_difference)]
     reach = max(4, int(np.ceil(np.abs(z).max())))  # hardly any normal latent is beyond 4
     range_of = {"min": -reach, "max": reach, "step": 0.05, "readout_format": ".1f"}

@@ -9,7 +9,6 @@ from stad_lab.viz.plots import (
     STYLES,
     difference_colors,
     plot_bars,
-    plot_claims,
     plot_curves,
     plot_histograms,
     plot_history,
@@ -22,11 +21,10 @@ from stad_lab.viz.plots import (
 )
 
 
-def test_a_condition_that_the_first_variant_lacks_is_drawn_for_the_others():
-    paper, ours = (827.0, [827.0, 827.0], []), (637.0, [600.0, 670.0], [637.0])
-    figure = plot_claims(
-        {"frame": {"the paper": paper}, "input": {"the paper": paper, "ours": ours}}
-    )
+def test_a_series_that_the_first_row_lacks_is_drawn_and_named_for_the_others():
+    one = (827.0, [827.0, 827.0])
+    rows = {"frame": {"the paper": one}, "input": {"the paper": one, "ours": (637.0, [600, 670])}}
+    figure = plot_intervals({"": rows}, "T", "x")
     assert [text.get_text() for text in figure.legends[0].texts] == ["the paper", "ours"]
     assert any(637.0 in line.get_xdata() for line in figure.axes[0].lines)
 
