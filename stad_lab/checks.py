@@ -42,13 +42,13 @@ def check(
 def check_kind(what: str, found: object, expected: object) -> None:
     """Raise AssertionError if an answer is no number, array or tensor where one is expected."""
     kind, wanted = type(found).__name__, type(expected).__name__
+    is_tensor, wants_tensor = (isinstance(one, torch.Tensor) for one in (found, expected))
     if found is None:
         raise AssertionError(f"{what} is None: end your function with `return` and the result")
-    if isinstance(found, torch.Tensor) and not isinstance(expected, torch.Tensor):
+    if is_tensor and not wants_tensor:
         remedy = "an array: use .numpy()" if np.ndim(expected) else "a number: use float(...)"
         raise AssertionError(f"{what} is a tensor: expected {remedy}")
-    no_tensor = isinstance(expected, torch.Tensor) and not isinstance(found, torch.Tensor)
-    if isinstance(found, str | dict) or no_tensor:
+    if isinstance(found, str | dict) or (wants_tensor and not is_tensor):
         raise AssertionError(f"{what} is of type {kind}: expected {wanted}")
     if isinstance(found, list | tuple) and isinstance(expected, np.ndarray):
         raise AssertionError(f"{what} is a {kind}: expected an array; wrap it in np.array(...)")

@@ -68,8 +68,7 @@ def vae_metrics(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> dict:
     """
     found, true = reconstruct(vae, frames, earlier), normalise(frames)
     error = ((found.frames - true) ** 2).sum(axis=-1)
-    difference = difference_image(frames, earlier)
-    changed = found.differences
+    difference, changed = difference_image(frames, earlier), found.differences
     if changed is not None:
         changed = float(((changed - difference) ** 2).sum(axis=(1, 2, 3)).mean())
     regions = {}
@@ -205,13 +204,12 @@ def horizon_errors(
     Frames are compared, not latents: an inactive latent is noise in the dream as well as in V.
 
     Args:
-        dreamed: float32 (dreams, episodes, steps, latent_size), from `dream_open_loop`.
+        dreamed: from `dream_open_loop`.
         mu: V's means of the real frames, float32 (episodes, T, latent_size).
         steps: at which to compare, 1 for the first dreamed frame.
 
     Returns:
-        "one dream", "mean of the dreams" and "the last frame seen" -> root mean squared error at
-        these steps, as a share of that of the mean frame of the step.
+        Root mean squared errors at these steps, as a share of that of the mean frame of the step.
     """
     last = decode(vae, mu[:, awake - 1])
     errors = {"one dream": [], "mean of the dreams": [], "the last frame seen": []}
