@@ -6,7 +6,7 @@
     mdn_rnn  the NLL of M beside simple predictions and reduced M, its calibration, and the error
              of its dreams
 
-The shipped V and M are measured, those without the bar ("cropped_...") if not said otherwise. What
+The shipped V and M are measured, those without the bar (`cropped_...`) if not said otherwise. What
 they are compared with is trained in a working folder, on a dataset of its own, and kept there.
 """
 
