@@ -12,7 +12,7 @@ from gallery import CELLS, PICTURES
 from PIL import Image
 
 from stad_lab import cli, config
-from stad_lab.viz.replication import CONDITIONS, plot_forest, signed
+from stad_lab.viz.replication import CONDITIONS, difference_of, plot_forest
 
 PACKAGE = Path(config.__file__).parent
 PRETRAINED = PACKAGE / "pretrained"
@@ -49,9 +49,7 @@ def results_table(claims: dict) -> str:
         found = claims["recipes"][condition]
         for variant in config.VARIANTS[1:]:
             one = found[variant]
-            low, high = one["interval"]
-            difference = f"{signed(one['difference'])} ({round(low)} to {round(high)})"
-            means = (f"{found['frame']['mean']:.0f}", f"{one['mean']:.0f}", difference)
+            means = (f"{found['frame']['mean']:.0f}", f"{one['mean']:.0f}", difference_of(one))
             name = f"{title[0]} `{variant}`"
             runs = str(len(one["runs"]))
             outcome = verdict(claims["verdict"][condition])

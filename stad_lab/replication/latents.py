@@ -6,7 +6,7 @@
     mdn_rnn  the NLL of M beside simple predictions and reduced M, its calibration, and the error
              of its dreams
 
-The shipped V and M are measured, if not said otherwise those whose names begin with "cropped". What
+The shipped V and M are measured, those without the bar (`cropped_...`) if not said otherwise. What
 they are compared with is trained in a working folder, on a dataset of its own, and kept there.
 """
 
@@ -63,9 +63,6 @@ HORIZON = [1, 2, 3, 5, 7, 10, 14, 20, 30, 40, 50, 60, 70, 80, 90, 100]  # dreame
 RESAMPLES = 1000  # of the trajectories, for an interval
 DREAMERS = 60  # trajectories from which M dreams on
 
-Drivers = dict[str, tuple[list[Trajectory], int]]
-"""Driver -> its trajectories, and how many first frames of each are not probed."""
-
 
 @dataclass(frozen=True)
 class Study:
@@ -84,6 +81,11 @@ class Encoder(NamedTuple):
     stride: int
     crop_bar: bool
     memories: dict[str, MDNRNN]
+
+
+def encoder_of(model: WorldModel, memories: dict[str, MDNRNN]) -> Encoder:
+    """V of a world model, with some M."""
+    return Encoder(model.vae, model.stride, model.crop_bar, memories)
 
 
 def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[str]) -> dict:
@@ -114,8 +116,11 @@ def random_trajectories(count: int, seed: int, processes: int) -> list[Trajector
         return run_in_order(executor, record_random_trajectory, tasks, "random driver")
 
 
-def two_drivers(driven: list[Trajectory], processes: int) -> Drivers:
-    """The random driver's trajectories, and a third as many of AGENT: the road at speed."""
+def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, tuple]:
+    """The random driver's trajectories, and a third as many of AGENT: the road at speed.
+
+    Returns driver -> (trajectories, number of first frames of each that are not probed).
+    """
     tracks = track_seeds("inspect", max(FEWEST, len(driven) // 3), 2)
     tasks = [(load_agent(AGENT), track, AGENT_FRAMES) for track in tracks]
     with worker_threads(processes) as executor:
@@ -139,30 +144,23 @@ def probe_part(study: Study) -> dict:
     for prefix in ("cropped_", ""):
         for variant, model in shipped(prefix):
             memories = {"z, h": model.mdn_rnn, "z, h of an untrained M": mdn_rnn}
-            own = Encoder(model.vae, model.stride, model.crop_bar, memories)
-            encoders[f"{prefix}{variant}"] = own
+            encoders[f"{prefix}{variant}"] = encoder_of(model, memories)
     for name, vae in untrained.items():
         encoders[f"{name}, untrained"] = Encoder(vae, v.stride, config.data.crop_bar, {})
     for stride in STRIDES:
         encoders[f"stride {stride}"] = shorter_encoder(study, stride=stride)
-    return {"drivers": probe_all(two_drivers(study.trajectories, config.processes), encoders)}
-
-
-def probe_all(drivers: Drivers, encoders: dict[str, Encoder]) -> dict:
-    """Driver -> encoder -> what `probe_trajectories` finds."""
-    return {
+    found = {
         driver: {name: probe_trajectories(*driven, one) for name, one in encoders.items()}
-        for driver, driven in drivers.items()
+        for driver, driven in two_drivers(study.trajectories, config.processes).items()
     }
+    return {"drivers": found}
 
 
 def probe_trajectories(driven: list[Trajectory], skip: int, encoder: Encoder) -> dict:
     """Probe the mean of z, which C sees, and z with the memory of each M.
 
     Only frames count in which the road is in sight, after the first `skip` of each trajectory.
-
-    Returns:
-        {"z": {quantity: {"r2": number, "interval": [low, high]}}}, and so for every M.
+    Returns {"z": {quantity: {"r2": number, "interval": [low, high]}}}, and so for every M.
     """
     vae, stride, crop_bar, memories = encoder
     latents = [encode_trajectory(vae, one, stride, crop_bar)[0] for one in driven]
@@ -188,26 +186,21 @@ def probe_trajectories(driven: list[Trajectory], skip: int, encoder: Encoder) ->
 def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> dict:
     """Probe V and M of a shipped agent or a run's folder, on `count` random trajectories.
 
-    Returns:
-        A dict for JSON: "variant", checksums of "vae" and "mdn_rnn", "trajectories", "drivers"
-        (driver -> what `probe_trajectories` finds of "z" and of "z, h") and "made_with".
-
-    Raises:
-        ValueError: too few trajectories, or V and M that do not belong together.
-        FileNotFoundError: no V or M there.
+    Returns a dict for JSON; "drivers" is driver -> what `probe_trajectories` finds. Raises
+    ValueError for too few trajectories, or V and M that do not belong together, and
+    FileNotFoundError if they are not there.
     """
     if count < FEWEST:
         raise ValueError(f"episodes={count}: expected at least {FEWEST}, to fit and measure on")
     model = load_world_model(run_folder(source))
     drivers = two_drivers(random_trajectories(count, PROBE_SEED, processes), processes)
-    encoder = Encoder(model.vae, model.stride, model.crop_bar, {"z, h": model.mdn_rnn})
-    found = probe_all(drivers, {"run": encoder})
+    encoder = encoder_of(model, {"z, h": model.mdn_rnn})
     return {
         "kind": "probe",
         "variant": model.vae.variant,
         **model.checksums,
         "trajectories": count,
-        "drivers": {driver: by_encoder["run"] for driver, by_encoder in found.items()},
+        "drivers": {name: probe_trajectories(*driven, encoder) for name, driven in drivers.items()},
         "made_with": provenance("python -m stad_lab probe --run ..."),
     }
 
@@ -225,8 +218,7 @@ def describe_probe(found: dict) -> str:
 
 def shorter_encoder(study: Study, **change) -> Encoder:
     """V of `input_output`, trained with one change for a share of the steps; kept in `work`."""
-    ((name, value),) = change.items()
-    usual = study.config.vae
+    ((name, value),), usual = change.items(), study.config.vae
     if value == getattr(usual, name):  # no change: one training serves all comparisons
         name, value = "stride", usual.stride
     folder = study.work / f"{name}_{value:g}"
@@ -240,18 +232,16 @@ def shorter_encoder(study: Study, **change) -> Encoder:
 def vae_part(study: Study) -> dict:
     """Measure V of every variant, and rate against distortion."""
 
-    def measured(vae: VAE, stride: int, crop_bar: bool) -> dict:
+    def measured(encoder: Encoder) -> dict:
+        vae, stride, crop_bar, _ = encoder
         films = [one.frames(crop_bar) for one in study.trajectories]
         frames = np.concatenate([film[stride::3] for film in films])
         earlier = np.concatenate([earlier_frames(film, stride)[stride::3] for film in films])
         return metrics.vae_metrics(vae, frames, earlier)
 
-    variants = {
-        variant: measured(model.vae, model.stride, model.crop_bar) for variant, model in shipped()
-    }
-    shorter = {f"{one:g}": shorter_encoder(study, kl_weight=one) for one in KL_WEIGHTS}
-    distortion = {weight: measured(*one[:3]) for weight, one in shorter.items()}
-    return {"variants": variants, "rate_distortion": distortion}
+    variants = {variant: measured(encoder_of(model, {})) for variant, model in shipped()}
+    shorter = {f"{one:g}": measured(shorter_encoder(study, kl_weight=one)) for one in KL_WEIGHTS}
+    return {"variants": variants, "rate_distortion": shorter}
 
 
 def mdn_rnn_part(study: Study) -> dict:
@@ -287,11 +277,8 @@ def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
     Their nll (trajectories, frames, latent_size) counts on the second half of the trajectories, as
     the simple ones need the first, on frames that all predict, and where `active` (latent_size,).
     """
-    frames = min(found.shape[1] for found in nll.values())
-    means = {
-        name: found[len(found) // 2 :, -frames:, active].mean(axis=(1, 2))
-        for name, found in nll.items()
-    }
+    half, frames = len(nll["M"]) // 2, min(found.shape[1] for found in nll.values())
+    means = {name: one[half:, -frames:, active].mean(axis=(1, 2)) for name, one in nll.items()}
     return {
         name: {
             "nats": float(found.mean()),
@@ -304,13 +291,12 @@ def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
 
 def simple_predictions(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
     """NLL of predictions without a network, fitted on the first half of the trajectories."""
-    half = len(z) // 2
-    fitted = z[:half], actions[:half]
+    first, driven = z[: len(z) // 2], actions[: len(z) // 2]
     return {
-        "always the same": metrics.constant_prediction(z[:half], z),
-        "repeat the last z": metrics.repeat_prediction(z[:half], z),
-        "linear, last z": metrics.linear_prediction(*fitted, z, actions, order=1),
-        "linear, last 4 z": metrics.linear_prediction(*fitted, z, actions, order=4),
+        "always the same": metrics.constant_prediction(first, z),
+        "repeat the last z": metrics.repeat_prediction(first, z),
+        "linear, last z": metrics.linear_prediction(first, driven, z, actions, order=1),
+        "linear, last 4 z": metrics.linear_prediction(first, driven, z, actions, order=4),
     }
 
 
@@ -324,7 +310,12 @@ def reduced_predictions(
         config = study.config.replace(variant=model.vae.variant, mdn_rnn={"batch": batch} | changes)
         path = study.work / name.replace(" ", "_") / weights.MDN_RNN_FILE
         if not path.exists():
-            train_reduced(config, study.dataset, path, model, sees_actions)
+            dataset = Dataset(study.dataset)
+            shown = [action * sees_actions for action in dataset.actions]
+            encoded = encode_dataset(model.vae, dataset, model.stride)
+            latents = Latents(encoded, shown, dataset.first_heldout, model.checksums["vae"])
+            with torch_settings(config.seed, 1) as device:
+                fit_mdn_rnn(config, latents, path, device)
         mdn_rnn, metadata = weights.load_mdn_rnn(path)
         weights.check_belongs(path, metadata, vae=model.checksums["vae"])
         check_same(path, metadata["mdn_rnn"], dataclasses.asdict(config.mdn_rnn))
@@ -334,18 +325,6 @@ def reduced_predictions(
         else:
             result[name] = metrics.single_step_nll(mdn_rnn, z, actions)
     return result
-
-
-def train_reduced(
-    config: Config, dataset_folder: Path, path: Path, model: WorldModel, sees_actions: bool
-) -> None:
-    """Train an M for V of `model`, with actions or without, into the file `path`."""
-    dataset = Dataset(dataset_folder)
-    shown = [action * sees_actions for action in dataset.actions]
-    encoded = encode_dataset(model.vae, dataset, model.stride)
-    latents = Latents(encoded, shown, dataset.first_heldout, model.checksums["vae"])
-    with torch_settings(config.seed, 1) as device:
-        fit_mdn_rnn(config, latents, path, device)
 
 
 PARTS = {"probe": probe_part, "vae": vae_part, "mdn_rnn": mdn_rnn_part}

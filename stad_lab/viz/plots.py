@@ -175,8 +175,8 @@ def plot_road(
     (x, y), far = road[center], np.array([-reach, reach])
     axes[0, 1].set(xlim=x + far, ylim=y + far, title=f"around tile {center}")
     axes[0, 1].legend(fontsize=8)
-    lead = f"A lap of {len(road)} tiles, and enlarged around tile {center}: the paths of "
-    return describe(figure, title, lead, paths)
+    lead = f"A lap of {len(road)} tiles from above, and enlarged around tile {center}: "
+    return describe(figure, title, f"{lead}the paths of ", paths)
 
 
 def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> Figure:

@@ -30,7 +30,7 @@ def plot_forest(recipes: dict[str, dict[str, dict]], best_episode: float) -> Fig
         base = found["frame"]["mean"]
         axis.set_title(f"{title} (frame: {base:.0f} points)", loc="left", fontsize=10)
         plot_condition(axis, found)
-        others = [describe(variant, found[variant]) for variant in COLOURS if variant != "frame"]
+        others = [f"{name} {difference_of(found[name])}" for name in COLOURS if name != "frame"]
         described += [f"{title.split(',')[0]}, frame {base:.0f}: " + ", ".join(others) + "."]
     ends = [end for axis in axes[1:] for end in axis.get_xlim()]
     for axis in axes[1:]:
@@ -76,10 +76,10 @@ def shade_from(axis: Axes, start: float) -> None:
     axis.set_xlim(low, high)
 
 
-def describe(variant: str, one: dict) -> str:
-    """A variant's difference in words, for the alternative text."""
+def difference_of(one: dict) -> str:
+    """A variant's difference to `frame` with its interval, as on the pages."""
     low, high = one["interval"]
-    return f"{variant} {signed(one['difference'])} ({round(low)} to {round(high)})"
+    return f"{signed(one['difference'])} ({round(low)} to {round(high)})"
 
 
 def signed(number: float) -> str:
