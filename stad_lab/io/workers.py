@@ -8,7 +8,6 @@ place, for example that of a Dask cluster. What a task returns depends on its ar
 import contextvars
 import itertools
 import multiprocessing
-import operator
 import os
 import signal
 import sys
@@ -214,5 +213,5 @@ def run_in_order(
 ) -> list:
     """The results of all tasks in their order; with a progress bar if it has a label."""
     finished = run_tasks(executor, function, tasks)
-    bar = tqdm(finished, label, len(tasks), unit="episode", disable=label is None)
-    return [result for _, result in sorted(bar, key=operator.itemgetter(0))]
+    results = dict(tqdm(finished, label, len(tasks), unit="episode", disable=label is None))
+    return [results[number] for number in range(len(tasks))]

@@ -77,12 +77,13 @@ def evolve(
     kept, done = kept_generation(folder, log), len(log["generations"])
     if watch and done:
         watch(log["generations"])
-    if log["best"] and kept == log["best"]["generation"] and done >= settings.generations:
+    chosen = log["best"] and log["best"]["generation"]
+    if chosen and kept == chosen and done >= settings.generations:
         return False
     with locked(folder), threadpool_limits(1):
         run = resume(config, folder, world_model, log)
-        if log["best"] and kept != log["best"]["generation"]:
-            keep_controller(run, run.controller(log["best"]["generation"]))
+        if chosen and kept != chosen:
+            keep_controller(run, run.controller(chosen))
         with worker_threads(config.processes, executor) as executor:
             source = hand_out(executor, folder)
             label = f"evolve C ({config.variant})"

@@ -52,7 +52,6 @@ def fine_tune(
     """Continue CMA-ES from the C of the run in `earlier`; False if everything was finished already.
 
     `folder` becomes a run of its own, with copies of V and M and with the earlier run's record.
-
     `config` is made by `fine_tuning_config`; `executor` is as for `evolve`.
 
     Raises:

@@ -62,15 +62,11 @@ def check_earlier_agent(config: Config, earlier: Path) -> None:
     world_model = load_agent(Path(earlier)).world_model
     variant, crop_bar = world_model.vae.variant, world_model.crop_bar
     if variant != config.variant:
-        raise ValueError(
-            f"variant={config.variant!r}, but the run in {earlier} is of {variant!r}: give a run of"
-            " the same variant"
-        )
+        found = f"variant={config.variant!r}, but the run in {earlier} is of {variant!r}"
+        raise ValueError(f"{found}: give a run of the same variant")
     if crop_bar != config.data.crop_bar:
-        raise ValueError(
-            f"data.crop_bar={config.data.crop_bar}, but the run in {earlier} has {crop_bar}: set"
-            " the same, or train a first iteration with it"
-        )
+        found = f"data.crop_bar={config.data.crop_bar}, but the run in {earlier} has {crop_bar}"
+        raise ValueError(f"{found}: set the same, or train a first iteration with it")
 
 
 def order_of_episodes(config: Config) -> list[int]:
@@ -94,9 +90,9 @@ def drive_either(
 
 
 class NoisyDriver:
-    """An agent whose steering and gas are disturbed, in each episode by another strength of noise.
+    """An agent whose steering and gas are disturbed, so that it meets many situations.
 
-    So it meets many situations. M receives the disturbed actions.
+    Every episode has another strength of noise. M receives the disturbed actions.
     """
 
     def __init__(self, agent: Agent, rng: np.random.Generator):
@@ -131,7 +127,7 @@ def drive_noisily(agent: Agent, config: Config, index: int) -> Episode:
 
 
 def carry_over(config: Config, earlier: Path, dataset: Callable[[], Dataset], folder: Path) -> bool:
-    """Fit the C that acts on the new V and M, in `folder`, as the earlier one; writes START_FILE.
+    """Fit the C whose outputs on V and M in `folder` are the earlier C's; writes START_FILE.
 
     False if it was there already. ValueError or FileNotFoundError if a file is damaged or missing.
     """
