@@ -43,8 +43,7 @@ class Agent:
 
     Args:
         world_model: V and M.
-        parameters: of C, (parameters,), or one row for each car (cars, parameters). ValueError if
-            their number does not fit V's latents and M's memory.
+        parameters: of C, (parameters,), or one row for each car (cars, parameters).
     """
 
     def __init__(self, world_model: WorldModel, parameters: np.ndarray):
@@ -244,9 +243,8 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
 def encode_episode(vae: VAE, frames: np.ndarray, stride: int) -> np.ndarray:
     """V's mu and logvar for the frames of an episode, uint8 (T, 64, 64, 3) -> float32 (2, T, z)."""
     device, count = next(vae.parameters()).device, max(1, len(frames) // CHUNK)
-    both = (np.array_split(part, count) for part in (frames, earlier_frames(frames, stride)))
-    parts = []
-    for pair in zip(*both, strict=True):
+    parts, earlier = [], earlier_frames(frames, stride)
+    for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
         pictures = (to_tensor(picture).to(device) for picture in to_pictures(*pair))
         parts.append(torch.stack(vae.encode(*pictures)))
     return torch.cat(parts, dim=1).cpu().numpy()
