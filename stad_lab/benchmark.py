@@ -243,8 +243,8 @@ def generation_speed(
 def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     """Microseconds that each part of a frame takes for one car of a batch, resets included.
 
-    "all else" is what the rest of the loop takes, mostly Python. A profiler, which slows Python
-    down a little, times the parts in one drive; another drive without it gives the whole.
+    "all else" is what the rest of the loop takes, mostly Python. A profiler times one drive; it
+    slows Python down a little.
     """
     single_thread()
     parts = {
@@ -255,9 +255,8 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     agent, profile = load_agent(SOURCE), cProfile.Profile()
     batch = Agent(agent.world_model, np.repeat(agent.parameters[None], cars, axis=0))
     drive(batch, range(cars), max_frames=5)
-    profile.runcall(drive, batch, range(cars), max_frames=frames)
     begin = time.perf_counter()
-    count = drive(batch, range(cars), max_frames=frames).lengths.sum()
+    count = profile.runcall(drive, batch, range(cars), max_frames=frames).lengths.sum()
     whole = time.perf_counter() - begin
     codes = {name: [inspect.unwrap(one).__code__ for one in own] for name, own in parts.items()}
     stats = pstats.Stats(profile).stats
