@@ -211,7 +211,7 @@ def costs_table(claims: dict) -> str:
     """The time of one frame with 16 cars, part by part."""
     costs = claims["speed"]["loop: microseconds of a frame, 16 cars in one process"]
     lines = sorted(costs.items(), key=lambda one: -one[1])
-    return table(("part", "microseconds a frame"), [(name, f"{one:.0f}") for name, one in lines])
+    return table(("part", "microseconds a frame"), [(name, f"{one:.1f}") for name, one in lines])
 
 
 def training_table(claims: dict) -> str:
