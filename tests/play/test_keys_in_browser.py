@@ -8,14 +8,19 @@ from stad_lab import load_agent
 from stad_lab.play.session import Session
 from stad_lab.play.widget import drive_yourself
 session = Session(load_agent("input"), track=1)
+for _ in range(frames):
+    session.step()
 drive_yourself(session)
 """
 
 
-@pytest.fixture
-def seat(run):  # noqa: F811
-    """A page in JupyterLab's command mode, the pointer in a corner: (page, reads, cells)."""
-    page = run(SEAT, "1 + 1")
+@pytest.fixture(params=[0])
+def seat(run, request):  # noqa: F811
+    """A page in JupyterLab's command mode, the pointer in a corner: (page, reads, cells).
+
+    The parameter is the number of frames that were driven before.
+    """
+    page = run(f"frames = {request.param}\n{SEAT}", "1 + 1")
     status = page.locator(".widget-html", has_text="frame")
 
     def reads(text):
@@ -104,6 +109,7 @@ def test_text_can_be_typed_and_cells_run_while_the_car_drives(seat):
     assert cells() in (2, 3)  # Shift+Enter may have added one below the last
 
 
+@pytest.mark.parametrize("seat", [700], indirect=True)
 def test_keys_that_are_held_when_an_episode_ends_do_not_edit_the_notebook(seat):
     page, reads, cells = seat
     press_drive(page)
