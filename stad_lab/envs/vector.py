@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
@@ -63,6 +64,7 @@ class CarRacingVector(gym.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
         self.cars = Cars(num_envs, "observation", bar, *rules)
         self._ended = np.ones(num_envs, bool)  # until the first reset
+        self._begun = False
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict | None = None
@@ -77,17 +79,19 @@ class CarRacingVector(gym.vector.VectorEnv):
         Returns:
             Observations, uint8 (num_envs, 96, 96, 3), and {}.
         """
+        self._check_open()
         options = options or {}
         mask = options.get("reset_mask", np.ones(self.num_envs, bool))
         if np.shape(mask) != (self.num_envs,) or not np.any(mask):
             raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), one at least")
         if seed is None or isinstance(seed, int | np.integer):
             seed = [None if seed is None else seed + car for car in range(self.num_envs)]
-        if len(seed) != self.num_envs:
-            raise ValueError(f"{len(seed)} seeds: expected {self.num_envs}, one for each car")
+        whole = [one is None or isinstance(one, int | np.integer) for one in seed]
+        if len(whole) != self.num_envs or not all(whole):
+            raise ValueError(f"seed={seed!r}: expected {self.num_envs} whole numbers or one")
         which = np.flatnonzero(mask)
         self.cars.reset([seed[car] for car in which], which, options.get("randomize", True))
-        self._ended[which] = False
+        self._ended[which], self._begun = False, True
         return self.cars.draw(), {}
 
     def step(
@@ -96,16 +100,22 @@ class CarRacingVector(gym.vector.VectorEnv):
         """Drive all cars one frame; see Gymnasium's VectorEnv for what is returned.
 
         Raises:
-            ValueError: an action that is not finite or not one of the five.
+            ValueError: actions of another shape, not finite, or not one of the five.
+            ResetNeeded: before the first reset.
             RuntimeError: a car whose episode has ended must be reset first.
         """
+        self._check_open()
+        if not self._begun:
+            raise ResetNeeded("no episode has begun: call reset before step")
+        actions, shape = np.asarray(actions), self.action_space.shape
+        if actions.shape != shape:
+            raise ValueError(f"actions of shape {actions.shape}: expected {shape}, a car in a row")
         begin = np.flatnonzero(self._ended)
         if len(begin) and self.autoreset_mode != AutoresetMode.NEXT_STEP:
             raise RuntimeError(f"cars {begin.tolist()}: their episodes have ended, call reset")
         driving, rewards = np.flatnonzero(~self._ended), np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, bool)
-        actions = np.asarray(actions)[driving]
-        rewards[driving], terminated[driving] = self.cars.step(actions, driving)
+        rewards[driving], terminated[driving] = self.cars.step(actions[driving], driving)
         self.cars.reset(which=begin)
         truncated = self.cars.cars["frames"] >= self.max_episode_steps
         self._ended = terminated | truncated
@@ -118,6 +128,10 @@ class CarRacingVector(gym.vector.VectorEnv):
     def close_extras(self, **kwargs) -> None:
         """Release the memory of the tracks."""
         self.cars = None
+
+    def _check_open(self) -> None:
+        if self.closed:
+            raise ClosedEnvironmentError("this environment is closed: make another one")
 
     def _info(self, terminated: np.ndarray) -> dict:
         if not terminated.any():

@@ -31,7 +31,8 @@ def plot_forest(recipes: dict[str, dict[str, dict]], best_episode: float) -> Fig
         axis.set_title(f"{title} (frame: {base:.0f} points)", loc="left", fontsize=10)
         plot_condition(axis, found)
         others = [f"{name} {difference_of(found[name])}" for name in COLOURS if name != "frame"]
-        described += [f"{title.split(',')[0]}, frame {base:.0f}: " + ", ".join(others) + "."]
+        panel = title.replace("indicator ", "")
+        described += [f"{panel}, frame {base:.0f}: " + ", ".join(others) + "."]
     ends = [end for axis in axes[1:] for end in axis.get_xlim()]
     for axis in axes[1:]:
         axis.set_xlim(min(ends), max(ends))

@@ -6,6 +6,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from stad_lab.envs.car_racing import make_env
@@ -102,14 +103,15 @@ def test_seeds_count_up_from_one_number_or_are_given_for_each_car():
     assert np.array_equal(one, several)
     assert np.array_equal(one[2], make_env().reset(seed=6)[0])
     assert not np.array_equal(envs.reset()[0], one)
-    with pytest.raises(ValueError, match="2 seeds: expected 3, one for each car"):
-        envs.reset(seed=[1, 2])
+    for seeds in ([1, 2], "abc", [1, 2, "3"]):
+        with pytest.raises(ValueError, match="expected 3 whole numbers or one"):
+            envs.reset(seed=seeds)
 
 
-def test_a_step_before_the_reset_begins_episodes_or_is_refused():
-    zeros = np.zeros((CARS, 3), np.float32)
-    with pytest.raises(RuntimeError, match="call reset"):
-        CarRacingVector(CARS, autoreset_mode="SameStep").step(zeros)
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+def test_a_step_before_the_first_reset_is_refused(mode):
+    with pytest.raises(ResetNeeded, match="call reset"):
+        CarRacingVector(CARS, autoreset_mode=mode).step(np.zeros((CARS, 3), np.float32))
 
 
 @pytest.mark.parametrize(
@@ -127,12 +129,26 @@ def test_an_action_that_is_not_finite_is_refused():
         envs.step(np.full((CARS, 3), np.nan))
 
 
+@pytest.mark.parametrize("continuous", [True, False])
+def test_actions_for_more_or_fewer_cars_are_refused_also_after_an_end(continuous):
+    envs = CarRacingVector(CARS, continuous=continuous, max_episode_steps=1)
+    envs.reset(seed=0)
+    for _ in range(2):  # driving, then about to begin anew
+        for wrong in (np.zeros((CARS + 1, 3)), np.zeros(CARS - 1, int), None, "abc"):
+            with pytest.raises(ValueError, match="actions of shape"):
+                envs.step(wrong)
+        envs.step(envs.action_space.sample())
+
+
 def test_close_gives_the_tracks_back_and_may_come_twice():
     envs = CarRacingVector(CARS)
     envs.reset(seed=0)
     envs.close()
     envs.close()
     assert envs.cars is None and envs.closed
+    for call in (envs.reset, lambda: envs.step(np.zeros((CARS, 3)))):
+        with pytest.raises(ClosedEnvironmentError, match="make another one"):
+            call()
 
 
 def test_without_the_bar_only_the_bar_is_missing():
