@@ -271,7 +271,7 @@ def check_same(path: Path, was: dict, now: dict) -> None:
 
 
 def flatten(values: dict, prefix: str = "") -> dict:
-    """A nested dict as a flat one with dotted names."""
+    """A nested dict as a flat one with dotted names: {"a": {"b": 1}} -> {"a.b": 1}."""
     flat = {}
     for name, value in values.items():
         nested = isinstance(value, dict)

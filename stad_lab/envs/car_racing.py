@@ -10,9 +10,9 @@ from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
 
 from stad_lab.envs import physics, picture
-from stad_lab.envs.cars import Cars, road_polygons
+from stad_lab.envs.cars import Cars, pose_on, road_polygons
 from stad_lab.envs.frames import OBSERVATION_SHAPE
-from stad_lab.envs.track import TRACK_WIDTH, tile_colors
+from stad_lab.envs.track import tile_colors
 
 MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 FAST_ID = "StadLab/CarRacing-v3"
@@ -46,11 +46,9 @@ def place_car(
     racing = env.unwrapped
     if isinstance(racing, CarRacing):
         return racing.place(tile, speed=speed, turn=turn, offset=offset)
-    _, beta, x, y = racing.track[tile % len(racing.track)]
-    heading, across = beta + turn, offset * TRACK_WIDTH
+    heading, x, y = pose_on(racing.track, tile, turn, offset)
     racing.car.destroy()
-    place = x + across * np.cos(beta), y + across * np.sin(beta)
-    racing.car = car_dynamics.Car(racing.world, heading, *place)
+    racing.car = car_dynamics.Car(racing.world, heading, x, y)
     for wheel, (left, ahead) in zip(racing.car.wheels, car_dynamics.WHEELPOS, strict=True):
         # Gymnasium places the wheels as if the car faced north.
         corner = left * car_dynamics.SIZE, ahead * car_dynamics.SIZE

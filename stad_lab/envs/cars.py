@@ -147,11 +147,8 @@ class Cars:
             turn: heading against the road's direction, radians, positive to the left.
             offset: from the centre line, in half road widths, positive to the right.
         """
-        path = self.tracks[car].path
-        _, beta, x, y = path[tile % len(path)]
-        x += offset * TRACK_WIDTH * np.cos(beta)
-        y += offset * TRACK_WIDTH * np.sin(beta)
-        physics.place_car(self.cars, car, float(beta + turn), float(x), float(y), float(speed))
+        pose = pose_on(self.tracks[car].path, tile, turn, offset)
+        physics.place_car(self.cars, car, *pose, float(speed))
 
     def _numbers(self, which: np.ndarray | None) -> np.ndarray:
         return np.arange(len(self)) if which is None else np.asarray(which, np.int64)
@@ -184,6 +181,16 @@ class Cars:
         self.colors["background"][car] = random.uniform(0, 210, size=3)
         self.colors["grass"][car] = self.colors["background"][car]
         self.colors["grass"][car, random.integers(3)] += 20
+
+
+def pose_on(
+    path: Sequence, tile: int, turn: float = 0.0, offset: float = 0.0
+) -> tuple[float, float, float]:
+    """Heading, x and y of a car that `Cars.place` puts on a tile of a track's centre line."""
+    _, beta, x, y = path[tile % len(path)]
+    across = offset * TRACK_WIDTH
+    x, y = x + across * np.cos(beta), y + across * np.sin(beta)
+    return float(beta + turn), float(x), float(y)
 
 
 def road_polygons(track: Track) -> tuple[np.ndarray, np.ndarray]:

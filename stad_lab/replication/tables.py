@@ -11,9 +11,11 @@ from pathlib import Path
 import numpy as np
 import pandas
 
+from stad_lab.config import flatten
 from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.io.files import checksum_of_tensors, load_json, load_tensors, write_bytes
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
+from stad_lab.training.evolution import fitness_curves
 from stad_lab.training.pipeline import total_budget
 
 DATA = Path(__file__).parent / "data"
@@ -154,9 +156,7 @@ def describe_record(record: dict) -> dict:
 def add_log(run: dict, log: list[dict], to: Path) -> None:
     """Add the generations of a CMA-ES run to `generations` and to the file of all returns."""
     lines = pandas.DataFrame([run | flatten(entry) for entry in log])
-    fitness = [np.mean(returns, axis=1) for returns in lines["returns"]]
-    for name, statistic in (("worst", np.min), ("mean", np.mean), ("best", np.max)):
-        lines[name] = [statistic(values) for values in fitness]
+    lines["worst"], lines["mean"], lines["best"] = fitness_curves(log)
     arrays = ["returns", "tracks", "validation.returns"]
     replace_lines("generations", lines.drop(columns=arrays), to)
     path = to / "fitness.npz"
@@ -192,12 +192,3 @@ def save(name: str, table: pandas.DataFrame, folder: Path = DATA) -> None:
             table[column] = table[column].astype("Int64")
     text = table.to_csv(index=False, lineterminator="\n")
     write_bytes(folder / f"{name}.csv", text.encode())
-
-
-def flatten(values: dict, prefix: str = "") -> dict:
-    """{"a": {"b": 1}} -> {"a.b": 1}."""
-    found = {}
-    for name, value in values.items():
-        nested = isinstance(value, dict)
-        found |= flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}
-    return found

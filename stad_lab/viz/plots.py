@@ -15,7 +15,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from stad_lab.envs.car_racing import TRACK_WIDTH
+from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.evaluation.trajectories import MOTION, Inspection, Trajectory
 

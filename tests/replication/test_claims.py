@@ -6,9 +6,8 @@ import numpy as np
 import pandas
 import pytest
 
-from stad_lab.config import VARIANTS
+from stad_lab.config import VARIANTS, flatten
 from stad_lab.replication import claims, measurements
-from stad_lab.replication.tables import flatten
 
 
 def test_the_committed_file_is_what_the_tables_give():

@@ -4,7 +4,7 @@ import itertools
 
 import numpy as np
 
-from stad_lab.envs.car_racing import TRACK_WIDTH
+from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.viz.plots import (
     STYLES,
     difference_colors,
