@@ -17,6 +17,7 @@ import torch
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import FRAME_SIZE, FrameMemory, earlier_frames, to_frame, to_pictures
+from stad_lab.inference import Inference
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
     WorldModel,
@@ -26,7 +27,7 @@ from stad_lab.io.weights import (
 )
 from stad_lab.io.workers import check_cancelled
 from stad_lab.models.controller import check_parameters, control, parameter_count
-from stad_lab.models.mdn_rnn import MDNRNN, State
+from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE, to_tensor
 
 PRETRAINED = Path(__file__).parent / "pretrained"
@@ -39,24 +40,27 @@ class Agent:
     Attributes:
         latents: z of the last frame, float32 (cars, latent_size); None before the first.
         hidden: M's memory h that C saw with it, float32 (cars, hidden_size).
-        state: M's memory (h, c) after the last action, float32 (1, cars, hidden_size) each.
+        state: M's memory, h and c, after the last action, float32 (2, cars, hidden_size); None
+            before the first.
 
     Args:
         world_model: V and M.
         parameters: of C, (parameters,), or one row for each car (cars, parameters).
+        remembers: whether M updates its memory; a C that does not see h drives the same without.
     """
 
-    def __init__(self, world_model: WorldModel, parameters: np.ndarray):
+    def __init__(self, world_model: WorldModel, parameters: np.ndarray, remembers: bool = True):
         check_parameters(parameters, parameter_count(*world_model.sizes))
         self.world_model, self.parameters = world_model, parameters
         self.vae, self.mdn_rnn = world_model.vae, world_model.mdn_rnn
+        self.inference, self.remembers = Inference(self.vae, self.mdn_rnn), remembers
         self.reset()
 
     def reset(self) -> None:
         """Forget the past: every episode begins with this."""
         self.memory = FrameMemory(self.world_model.stride)
         self.cars: np.ndarray | None = None  # which of the first step's cars still drive, (cars,)
-        self.state: State | None = None
+        self.state: np.ndarray | None = None
         self.latents: np.ndarray | None = None
         self.hidden: np.ndarray | None = None
 
@@ -68,7 +72,6 @@ class Agent:
         """
         return self.act_batch([to_frame(observation, self.world_model.crop_bar)])[0]
 
-    @torch.inference_mode()
     def act_batch(self, seen: Sequence[np.ndarray]) -> np.ndarray:
         """The actions for a batch of cars: float32 (cars, 3). ValueError as `act`.
 
@@ -81,19 +84,16 @@ class Agent:
             seen = [to_frame(observation, self.world_model.crop_bar) for observation in seen]
         frames = np.asarray(seen)
         if self.state is None:
-            self.cars = np.arange(len(frames))
-            zeros = torch.zeros(1, len(frames), self.mdn_rnn.hidden_size, dtype=torch.float32)
-            self.state = (zeros, zeros.clone())
-        frame, difference = map(to_tensor, to_pictures(frames, self.memory.push(frames)))
-        self.latents = self.vae.encode(frame, difference)[0].numpy()
-        self.hidden = self.state[0][0].numpy()
+            self.cars, self.state = np.arange(len(frames)), self._no_memory(len(frames))
+        self.latents = self.inference.encode(frames, self.memory.push(frames))
+        self.hidden = self.state[0]
         features = np.concatenate([self.latents, self.hidden], axis=1)
         actions = control(self.present_parameters(), features)
-        self.remember(actions, self.state)
+        if self.remembers:
+            self.remember(actions, self.state)
         return actions
 
-    @torch.inference_mode()
-    def remember(self, actions: np.ndarray, before: State | None) -> None:
+    def remember(self, actions: np.ndarray, before: np.ndarray | None) -> None:
         """Update M's memory with the last z and these actions, float32 (cars, 3).
 
         `act` does it with its own actions. A driver that changes them calls this again.
@@ -102,8 +102,9 @@ class Agent:
             before: `state` as it was before that `act`.
         """
         self._check_acted()
-        latents, done = torch.from_numpy(self.latents)[:, None], torch.from_numpy(actions)[:, None]
-        _, self.state = self.mdn_rnn.remember(latents, done, before)
+        if before is None:
+            before = self._no_memory(len(self.latents))
+        self.state = self.inference.remember(self.latents, actions, before)
 
     def present_parameters(self) -> np.ndarray:
         """C's parameters for the present cars: one vector for all, or a row for each."""
@@ -113,9 +114,12 @@ class Agent:
         """Continue with some of the present cars, by their indices, until the next reset."""
         self._check_acted()
         self.memory.keep(cars)
-        self.state = tuple(part[:, cars] for part in self.state)
+        self.state = self.state[:, cars]
         self.latents, self.hidden = self.latents[cars], self.hidden[cars]
         self.cars = self.cars[cars]
+
+    def _no_memory(self, cars: int) -> np.ndarray:
+        return np.zeros((2, cars, self.mdn_rnn.hidden_size), np.float32)
 
     def _check_acted(self) -> None:
         if self.latents is None:

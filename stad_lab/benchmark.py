@@ -9,7 +9,6 @@ Speeds depend on the machine, so contenders do the same work in turns, in altern
 median of the rounds counts. It takes about ten minutes on an otherwise idle machine, on the CPU.
 """
 
-import copy
 import cProfile
 import functools
 import importlib.metadata
@@ -32,15 +31,15 @@ from stad_lab.agent import Agent, drive, load_agent
 from stad_lab.config import Config, track_seeds
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
-from stad_lab.envs.frames import FrameMemory, to_pictures
+from stad_lab.envs.frames import FrameMemory
 from stad_lab.envs.vector import CarRacingVector
 from stad_lab.evaluation.parity import AREAS, compare_pictures
+from stad_lab.inference import Inference
 from stad_lab.io.files import save_json
-from stad_lab.io.weights import WorldModel
 from stad_lab.io.workers import run_in_order, single_thread, worker_processes, worker_threads
 from stad_lab.models.controller import control
 from stad_lab.models.mdn_rnn import MDNRNN
-from stad_lab.models.vae import VAE, to_tensor
+from stad_lab.models.vae import VAE
 from stad_lab.training.dataset import Dataset, RandomDriver, collect
 from stad_lab.training.evolution import drive_parallel
 from stad_lab.training.mdn_rnn import Latents, mdn_rnn_training
@@ -203,9 +202,6 @@ def measure_loop(rounds: int) -> dict:
             "V + M + C, 1 thread": functools.partial(speed, one, world_model),
             "V + M + C, 2 threads": functools.partial(speed, two, world_model),
         }
-        if getattr(torch.cpu, "get_capabilities", dict)().get("avx512_bf16"):
-            low = with_bfloat16(world_model)
-            contenders["V + M + C, 2 threads, V in bfloat16"] = functools.partial(speed, two, low)
         tables = {"frames a second, a generation": take_turns(contenders, rounds, "loop")}
         batches = {}
         for cars in (1, 2, 4, 8, 16, 32):
@@ -216,18 +212,6 @@ def measure_loop(rounds: int) -> dict:
         budgets = [one.submit(frame_budget, CARS).result() for _ in range(rounds)]
     medians = {part: float(np.median([own[part] for own in budgets])) for part in budgets[0]}
     return tables | {f"microseconds of a frame, {CARS} cars in one process": medians}
-
-
-def with_bfloat16(world_model: WorldModel) -> WorldModel:
-    """V and M, of which V computes in bfloat16: half the bits, so another line on the road."""
-    vae = copy.copy(world_model.vae)
-
-    def encode(*pictures: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        with torch.autocast("cpu", torch.bfloat16):
-            return tuple(part.float() for part in world_model.vae.encode(*pictures))
-
-    vae.encode = encode
-    return world_model._replace(vae=vae)
 
 
 def generation_speed(
@@ -249,8 +233,8 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     single_thread()
     parts = {
         "reset": [Cars.reset], "physics": [Cars.step], "picture": [Cars.draw],
-        "frames and differences": [FrameMemory.push, to_pictures, to_tensor],
-        "V": [VAE.encode], "M": [MDNRNN.remember], "C": [control],
+        "frames": [FrameMemory.push],
+        "V": [Inference.encode], "M": [Inference.remember], "C": [control],
     }  # fmt: skip
     agent, profile = load_agent(SOURCE), cProfile.Profile()
     batch = Agent(agent.world_model, np.repeat(agent.parameters[None], cars, axis=0))

@@ -9,6 +9,7 @@ from stad_lab.agent import Agent, EnvBatch, rollout, run_folder
 from stad_lab.envs.dream import DreamEnv
 from stad_lab.io.weights import load_world_model
 from stad_lab.models.controller import control
+from stad_lab.models.mdn_rnn import to_state
 
 
 def make_dream(source: str | Path = "frame", **options) -> DreamEnv:
@@ -54,11 +55,12 @@ def dream_on(
         raise ValueError(
             f"the agent drives {len(agent.cars)} cars, expected one: use agent.keep(np.array([0]))"
         )
+    state = to_state(agent.state)
     with torch.no_grad():
-        prediction = agent.mdn_rnn.mixture(agent.state[0].transpose(0, 1))
+        prediction = agent.mdn_rnn.mixture(state[0])
         latents = prediction.sample(temperature, torch.Generator().manual_seed(seed))[0, 0]
     env = DreamEnv(agent.vae, agent.mdn_rnn, temperature, frames, render_mode="rgb_array")
-    first, _ = env.reset(seed=seed, options={"latents": latents.numpy(), "state": agent.state})
+    first, _ = env.reset(seed=seed, options={"latents": latents.numpy(), "state": state})
     pictures, actions = [], []
 
     def record(_: np.ndarray, seen: np.ndarray, action: np.ndarray) -> None:

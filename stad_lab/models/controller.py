@@ -48,7 +48,7 @@ def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
     """
     weights, bias = unpack(np.atleast_2d(parameters))
     with np.errstate(invalid="ignore"):  # 0 x infinity is reported below
-        raw = (weights * features[:, None]).sum(-1) + bias
+        raw = np.einsum("...ij,...j->...i", weights, features.astype(weights.dtype)) + bias
     if not np.isfinite(raw).all():
         bad = raw[~np.isfinite(raw).all(axis=1)][0]
         raise ValueError(f"action {bad}: expected finite numbers; check z, h and C for NaN")

@@ -8,6 +8,7 @@ Models, Ha and Schmidhuber 2018, section 2.2; mixture density networks: Bishop 1
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -109,6 +110,11 @@ def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
     It is the logarithm of a density, so it may be negative.
     """
     return -mixture.log_likelihood(target).mean()
+
+
+def to_state(memory: np.ndarray | None) -> State | None:
+    """h and c, float32 (2, batch, hidden_size), as the LSTM takes them: copies; None stays None."""
+    return memory if memory is None else tuple(torch.tensor(part)[None] for part in memory)
 
 
 def check_temperature(temperature: float) -> None:

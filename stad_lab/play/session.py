@@ -19,6 +19,7 @@ from stad_lab.dreaming import Dreamer
 from stad_lab.envs.car_racing import make_env
 from stad_lab.envs.dream import DreamEnv
 from stad_lab.evaluation.trajectories import Trajectory, true_motion
+from stad_lab.models.mdn_rnn import to_state
 
 WORLDS, DRIVERS = ("real", "dream"), ("hand", "agent")
 PEDALS = ("left", "right", "gas", "brake")
@@ -132,7 +133,7 @@ class Session:
         """Continue on the "real" track, or in a new "dream" of its frame; else ValueError."""
         check_choice("world", world, WORLDS)
         if world == "dream":
-            options = {"latents": self.agent.latents[0], "state": self.before}
+            options = {"latents": self.agent.latents[0], "state": to_state(self.before)}
             self.latents, _ = self.dream.reset(seed=self.track, options=options)
             self.dream_rows, self.dream_ended = [], False
         self.world = world

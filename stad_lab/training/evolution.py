@@ -24,6 +24,7 @@ from stad_lab.io import weights
 from stad_lab.io.files import load_json, locked, save_json
 from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_world_model
 from stad_lab.io.workers import run_in_order, single_thread, worker_threads
+from stad_lab.models.controller import unpack
 from stad_lab.training.subspace import SearchSpace, search_space
 
 if TYPE_CHECKING:
@@ -362,7 +363,8 @@ def hand_out(executor: Executor, folder: Path) -> Any:
 def make_agent(source: Path | WorldModel, parameters: np.ndarray) -> Agent:
     """An agent of the V and M that `hand_out` names, and of C."""
     world_model = source if isinstance(source, WorldModel) else load_world_model(source)
-    return Agent(world_model, parameters)
+    sees_hidden = unpack(parameters)[0][..., world_model.vae.latent_size :].any()
+    return Agent(world_model, parameters, remembers=bool(sees_hidden))
 
 
 def fitness_curves(generations: list[dict]) -> np.ndarray:

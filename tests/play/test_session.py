@@ -7,6 +7,7 @@ import torch
 from stad_lab import load_agent
 from stad_lab.agent import remember_episode
 from stad_lab.evaluation.trajectories import driven_path, record_trajectory
+from stad_lab.models.mdn_rnn import to_state
 from stad_lab.play.session import Hand, Session
 
 
@@ -55,7 +56,7 @@ def test_m_remembers_the_actions_of_the_human(session):
     hidden = remember_episode(
         session.agent.mdn_rnn, np.array([*seen, session.agent.latents[0]]), done
     )
-    assert np.allclose(session.before[0][0, 0], hidden[-1], atol=1e-5)
+    assert np.allclose(session.before[0, 0], hidden[-1], atol=1e-5)
 
 
 def test_a_dream_begins_with_the_present_frame_and_the_real_car_waits(session):
@@ -142,7 +143,7 @@ def test_a_dream_begins_with_m_s_memory_from_before_the_present_frame(session):
         for part in (session.dream_trajectory().actions, session.agent.latents)
     )
     with torch.no_grad():
-        after, _ = session.agent.mdn_rnn.remember(seen, done, session.before)
+        after, _ = session.agent.mdn_rnn.remember(seen, done, to_state(session.before))
     assert np.allclose(session.dream.hidden, after[0, 0], atol=1e-5)
 
 

@@ -1,0 +1,282 @@
+"""V's encoder and M's memory, compiled: what drives the cars, in every frame of every episode.
+
+`models` has the networks as students read them and as they are trained. Here the same arithmetic
+runs on the CPU without PyTorch, whose calls cost more than the arithmetic if the batch is small. An
+agent of one car is six times as fast, one of 16 cars half as fast again.
+
+Everything is one operation, a layer: a patch of the input, times a matrix, plus a bias. For a
+convolution the patch is what lies below its kernel; for M it is z, the action and h side by side.
+The patches of several pixels or cars are multiplied together, because each weight that was read
+then serves for all of them. `tile` does 6 patches times 16 outputs: 96 sums, which fit into the
+processor's registers, so that only inputs and weights are read from memory. (This is how matrix
+libraries do it: Goto and van de Geijn 2008.)
+
+A sum is made in one order, whatever the batch or the width of the processor's vectors: a car's
+numbers do not depend on the other cars of the batch.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+from stad_lab.envs.compiling import compiled
+from stad_lab.envs.frames import FRAME_SIZE, normalise
+from stad_lab.models.mdn_rnn import MDNRNN
+from stad_lab.models.vae import VAE
+
+PATCHES, OUTPUTS = 6, 16  # of a tile: 12 vectors of AVX2, which has 16 registers
+KERNEL, STRIDE = 4, 2  # of V's convolutions
+PIXELS = normalise(np.arange(256, dtype=np.uint8))  # every value that a pixel of a frame can have
+
+
+class Layer(NamedTuple):
+    """A layer for a number of cars; float32, in memory with the channels last.
+
+    A patch is `rows` runs of `run` numbers of the input, which begin `row` numbers apart.
+    """
+
+    starts: np.ndarray  # where in the input each patch begins, int64 (patches,)
+    rows: int
+    row: int
+    run: int
+    weights: np.ndarray  # (outputs / OUTPUTS, rows x run, OUTPUTS), outputs filled up with zeros
+    bias: np.ndarray  # (outputs,)
+    floor: float  # least output: 0 for a ReLU, minus infinity for none
+
+
+@intrinsic
+def tile(typing_context, x, starts, layer_shape, weights, bias, y, ends):
+    """Write the sums of PATCHES patches for OUTPUTS outputs; see `run_layer` for the arguments.
+
+    Written for LLVM, because no loop in Python makes Numba keep the sums in registers.
+    """
+    signature = types.void(x, starts, layer_shape, weights, bias, y, ends)
+
+    def generate(context, builder, signature, arguments):
+        def pointer(position):
+            kind = signature.args[position]
+            return context.make_array(kind)(context, builder, arguments[position]).data
+
+        def unpack(position):
+            return [
+                builder.extract_value(arguments[position], i)
+                for i in range(len(signature.args[position]))
+            ]
+
+        vector, integer = ir.VectorType(ir.FloatType(), OUTPUTS), ir.IntType(64)
+        all_zero = ir.Constant(ir.VectorType(ir.IntType(32), OUTPUTS), [0] * OUTPUTS)
+        undefined, zero, one = ir.Constant(vector, ir.Undefined), integer(0), integer(1)
+        inputs, outputs = pointer(0), pointer(5)
+        rows, row, run, floor = unpack(2)
+
+        def address(array, index):
+            return builder.bitcast(builder.gep(array, [index]), vector.as_pointer())
+
+        def spread(scalar):
+            first = builder.insert_element(undefined, scalar, ir.IntType(32)(0))
+            return builder.shuffle_vector(first, undefined, all_zero)
+
+        def begin_loop(name, *variables):
+            before, block = builder.block, builder.append_basic_block(name)
+            builder.branch(block)
+            builder.position_at_end(block)
+            phis = [builder.phi(variable.type) for variable in variables]
+            for phi, variable in zip(phis, variables, strict=True):
+                phi.add_incoming(variable, before)
+            return block, phis
+
+        def end_loop(block, phis, values, goes_on):
+            for phi, value in zip(phis, values, strict=True):
+                phi.add_incoming(value, builder.block)
+            after = builder.append_basic_block("after")
+            builder.cbranch(goes_on, block, after)
+            builder.position_at_end(after)
+
+        sums = [builder.load(address(pointer(4), zero), align=4)] * PATCHES
+        patches = unpack(1)
+        outer, (number, base, weight, *sums) = begin_loop("row", zero, zero, zero, *sums)
+        end = builder.add(base, run)
+        inner, (at, at_weight, *partial) = begin_loop("run", base, weight, *sums)
+        factors = builder.load(address(pointer(3), at_weight), align=4)
+        added = []
+        for patch, total in zip(patches, partial, strict=True):
+            value = builder.load(builder.gep(inputs, [builder.add(patch, at)]))
+            # "contract": multiply and add in one instruction, rounded once.
+            product = builder.fmul(spread(value), factors, flags=["contract"])
+            added.append(builder.fadd(product, total, flags=["contract"]))
+        following = builder.add(at, one)
+        next_weight = builder.add(at_weight, integer(OUTPUTS))
+        goes_on = builder.icmp_signed("<", following, end)
+        end_loop(inner, (at, at_weight, *partial), (following, next_weight, *added), goes_on)
+        next_row = builder.add(number, one)
+        values = next_row, builder.add(base, row), next_weight, *added
+        goes_on = builder.icmp_signed("<", next_row, rows)
+        end_loop(outer, (number, base, weight, *sums), values, goes_on)
+        least = spread(floor)
+        for place, total in zip(unpack(6), added, strict=True):
+            kept = builder.select(builder.fcmp_ordered("<", total, least), least, total)
+            builder.store(kept, address(outputs, place), align=4)
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@compiled
+def run_layer(x: np.ndarray, layer: Layer, y: np.ndarray) -> None:
+    """y = max(patches of x times weights + bias, floor); x, y flat, y (patches x outputs)."""
+    starts, width, last = layer.starts, len(layer.bias), len(layer.starts) - 1
+    shape = layer.rows, layer.row, layer.run, np.float32(layer.floor)
+    for block in range(len(layer.weights)):  # its weights stay in the cache
+        weights, to = layer.weights[block].ravel(), OUTPUTS * block
+        bias = layer.bias[to : to + OUTPUTS]
+        for first in range(0, last + 1, PATCHES):
+            # A last tile with fewer patches repeats one.
+            a, b, c = first, min(first + 1, last), min(first + 2, last)
+            d, e, f = min(first + 3, last), min(first + 4, last), min(first + 5, last)
+            begin = starts[a], starts[b], starts[c], starts[d], starts[e], starts[f]
+            ends = (
+                a * width + to, b * width + to, c * width + to,
+                d * width + to, e * width + to, f * width + to,
+            )  # fmt: skip
+            tile(x, begin, shape, weights, bias, y, ends)
+
+
+@compiled
+def run_encoder(frames, earlier, pictures, layers, first, second):
+    """Encode frames into `second`; `pictures`, `first` and `second` are memory to work in."""
+    channels = pictures.shape[-1]
+    for car in range(len(frames)):
+        for row in range(FRAME_SIZE):
+            for column in range(FRAME_SIZE):
+                for color in range(3):
+                    value = PIXELS[frames[car, row, column, color]]
+                    pictures[car, row, column, color] = value
+                    if channels == 6:
+                        before = PIXELS[earlier[car, row, column, color]]
+                        pictures[car, row, column, 3 + color] = value - before
+    x, y, other = pictures.reshape(-1), first, second
+    for layer in layers:
+        run_layer(x, layer, y)
+        x, y, other = y, other, y
+
+
+@compiled(error_model="numpy")
+def run_memory(layer, seen, gates, state):
+    """One step of an LSTM: `state` (2, cars, hidden), h and c, is changed in place."""
+    hidden = state.shape[2]
+    run_layer(seen.reshape(-1), layer, gates.reshape(-1))
+    one = np.float32(1)
+    for car in range(state.shape[1]):
+        own = gates[car]
+        for i in range(hidden):
+            keep = one / (one + np.exp(-own[hidden + i]))
+            write = one / (one + np.exp(-own[i])) * np.tanh(own[2 * hidden + i])
+            state[1, car, i] = keep * state[1, car, i] + write
+            show = one / (one + np.exp(-own[3 * hidden + i]))
+            state[0, car, i] = show * np.tanh(state[1, car, i])
+
+
+class Inference:
+    """V's encoder and M's memory for driving. It has memory to work in: one for each thread.
+
+    Weights are copied: an Inference does not follow a training.
+    """
+
+    def __init__(self, vae: VAE, mdn_rnn: MDNRNN):
+        self.channels, self.latent_size = 6 if vae.sees_difference else 3, vae.latent_size
+        self.encoder, self.memory = pack_encoder(vae, self.channels), pack_memory(mdn_rnn)
+        self.cars = 0
+
+    def encode(self, frames: np.ndarray, earlier: np.ndarray) -> np.ndarray:
+        """V's mean mu of z, float32 (cars, latent_size).
+
+        Args:
+            frames: uint8 (cars, 64, 64, 3).
+            earlier: the frames that are subtracted from these for the difference images.
+        """
+        self._prepare(len(frames))
+        run_encoder(frames, earlier, self._pictures, self._layers, self._first, self._second)
+        width = len(self._layers[-1].bias)
+        latents = self._first[: len(frames) * width].reshape(-1, width)  # of five layers
+        return latents[:, : self.latent_size].copy()
+
+    def remember(self, latents: np.ndarray, actions: np.ndarray, state: np.ndarray) -> np.ndarray:
+        """M's memory h and c after z and an action, float32 (2, cars, hidden_size).
+
+        Args:
+            latents: float32 (cars, latent_size).
+            actions: float32 (cars, 3).
+            state: the memory before; it is not changed.
+        """
+        self._prepare(len(latents))
+        seen, state = np.concatenate([latents, actions, state[0]], axis=1), state.copy()
+        run_memory(self._memory, seen, self._gates, state)
+        return state
+
+    def _prepare(self, cars: int) -> None:
+        """Layers, and memory to work in, for so many cars."""
+        if cars == self.cars:
+            return
+        self.cars, size, channels, layers = cars, FRAME_SIZE, self.channels, []
+        for weights, bias in self.encoder[:-1]:
+            starts = convolution_starts(cars, size, channels)
+            shape = KERNEL, size * channels, KERNEL * channels
+            layers.append(Layer(starts, *shape, weights, bias, 0.0))
+            size, channels = (size - KERNEL) // STRIDE + 1, len(bias)
+        layers.append(dense_layer(cars, *self.encoder[-1]))
+        self._layers, self._memory = tuple(layers), dense_layer(cars, *self.memory)
+        largest = max(len(layer.starts) * len(layer.bias) for layer in layers)
+        self._first, self._second = np.empty((2, largest), np.float32)
+        self._pictures = np.empty((cars, FRAME_SIZE, FRAME_SIZE, self.channels), np.float32)
+        self._gates = np.empty((cars, len(self._memory.bias)), np.float32)
+
+
+Packed = tuple[np.ndarray, np.ndarray]  # weights and bias of a Layer
+
+
+def pack(weights: np.ndarray, bias: np.ndarray) -> Packed:
+    """Weights (inputs, outputs) and bias (outputs,) of a layer, filled up to whole tiles."""
+    missing = -len(bias) % OUTPUTS
+    weights = np.pad(weights, ((0, 0), (0, missing))).astype(np.float32)
+    tiles = weights.reshape(len(weights), -1, OUTPUTS).transpose(1, 0, 2)
+    return np.ascontiguousarray(tiles), np.pad(bias, (0, missing)).astype(np.float32)
+
+
+def pack_encoder(vae: VAE, channels: int) -> list[Packed]:
+    """The layers of V's encoder, of the last one the outputs for mu."""
+    *convolutions, last = [part for part in vae.encoder if hasattr(part, "weight")]
+    packed, kernels = [], [part.weight for part in convolutions]
+    kernels.append(last.weight[: vae.latent_size].unflatten(1, (-1, 2, 2)))
+    for part, kernel in zip([*convolutions, last], kernels, strict=True):
+        kernel = kernel.detach().cpu().permute(2, 3, 1, 0).numpy()  # channels last, then outputs
+        missing = channels - kernel.shape[2]  # channels that the layer before was filled up with
+        kernel = np.pad(kernel, ((0, 0), (0, 0), (0, missing), (0, 0)))
+        count = kernel.shape[3]
+        bias = part.bias.detach().cpu().numpy()[:count]
+        packed.append(pack(kernel.reshape(-1, count), bias))
+        channels = len(packed[-1][1])
+    return packed
+
+
+def pack_memory(mdn_rnn: MDNRNN) -> Packed:
+    """M's LSTM: both of its matrices as one, for z, the action and h side by side."""
+    lstm = mdn_rnn.lstm
+    weights = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], 1).detach().cpu().numpy()
+    return pack(weights.T, (lstm.bias_ih_l0 + lstm.bias_hh_l0).detach().cpu().numpy())
+
+
+def convolution_starts(cars: int, size: int, channels: int) -> np.ndarray:
+    """Where the patches of a convolution begin, in pictures of `size` x `size` pixels."""
+    steps = np.arange(0, size - KERNEL + 1, STRIDE)
+    pixels = (np.arange(cars)[:, None, None] * size + steps[:, None]) * size + steps
+    return pixels.ravel() * channels
+
+
+def dense_layer(cars: int, weights: np.ndarray, bias: np.ndarray) -> Layer:
+    """A layer whose patch is the whole row of a car."""
+    run = weights.shape[1]
+    return Layer(np.arange(cars) * run, 1, 0, run, weights, bias, -np.inf)
