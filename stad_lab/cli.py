@@ -271,26 +271,35 @@ def verify(run: tyro.conf.Positional[str]) -> int:
 
 
 def replicate(
-    experiment: str,
+    experiment: tyro.conf.Positional[str],
     out: str,
     seeds: list[int] | None = None,
+    only: list[str] | None = None,
     keep: bool = False,
     scheduler: str | None = None,
 ) -> None:
-    """Run one experiment of the replication: V and M, CMA-ES and an evaluation for every seed.
+    """Run a study of the protocol, such as study1, or an earlier experiment, with all its seeds.
 
-    It says first how long it took us. Stop it when you like; the same command continues.
+    It says first how long it will take. Stop it when you like; the same command continues. The
+    pipelines of a study are added to the tables of stad_lab/replication/data as they finish.
 
     Args:
-        experiment: Its name; `claims` lists them.
+        experiment: Its name: study1, pilot, or one of docs/experiments.md.
         out: Folder of all experiments, for example runs/replication.
-        seeds: Some of the experiment's seeds; all if not given.
-        keep: Only add the finished seeds to the tables of stad_lab/replication/data.
+        seeds: Some of its seeds; all if not given.
+        only: Some pipelines of a study, such as seed0/frame/z. Known ones are compared.
+        keep: Only add the finished seeds of an earlier experiment to the tables.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
-    from stad_lab.replication import run
+    from stad_lab.replication import run, study
 
     folder = output(out)
+    if experiment in study.STUDIES:
+        with cluster_of(scheduler) as executor:
+            study.run_study(experiment, folder, executor, seeds, only)
+        return
+    if only:
+        raise ValueError(f"--only {only[0]}: {experiment!r} is no study, and has seeds alone")
     if keep:
         kept = run.keep(experiment, folder, seeds)
         print("\n".join(f"kept {name}" for name in kept) or "no seed is finished")
@@ -298,6 +307,47 @@ def replicate(
     with cluster_of(scheduler) as executor:
         print(run.describe_time(experiment, seeds), flush=True)
         print(run.describe(experiment, run.replicate(experiment, folder, executor, seeds)))
+
+
+def evaluate_study(
+    study: tyro.conf.Positional[str],
+    first_track: int = 1000,
+    episodes: int = 400,
+    seeds: list[int] | None = None,
+    only: list[str] | None = None,
+    json: Path | None = None,
+    scheduler: str | None = None,
+) -> None:
+    """Drive the kept agents of a study on any tracks, with the fast renderer.
+
+    The tracks of the study's own score give its returns again, to the last bit on the same kind of
+    processor.
+
+    Args:
+        study: Its name, such as study1.
+        first_track: Seed of the first track.
+        episodes: Number of tracks.
+        seeds: Some seeds; all that are kept if not given.
+        only: Some pipelines, such as seed0/frame/z.
+        json: Where to write every episode.
+        scheduler: Address of a Dask scheduler, to drive on a cluster.
+    """
+    from stad_lab.evaluation.evaluate import check_tracks
+    from stad_lab.io.files import check_writable, save_json
+    from stad_lab.replication.study import evaluate_kept
+
+    check_tracks(episodes, first_track)
+    if json:
+        check_writable(json)
+    found, tracks = {}, range(first_track, first_track + episodes)
+    with cluster_of(scheduler) as executor:
+        for pipeline, result in evaluate_kept(study, tracks, seeds, only, executor=executor):
+            low, high = result["interval"]
+            text = f"mean return {result['mean']:.1f}, 95% interval {low:.1f} to {high:.1f}"
+            print(f"{pipeline.name}: {text}", flush=True)
+            found[pipeline.name] = result
+            if json:
+                save_json(json, {"kind": "study", "study": study, "agents": found})
 
 
 def claims() -> None:
@@ -420,6 +470,7 @@ COMMANDS: dict[str, Callable] = {
     "evaluate": evaluate,
     "verify": verify,
     "replicate": replicate,
+    "evaluate-study": evaluate_study,
     "claims": claims,
     "probe": probe,
     "latents": latents,

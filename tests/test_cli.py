@@ -324,7 +324,7 @@ def test_an_error_of_a_user_has_no_traceback(tmp_path, command_line):
 
 @pytest.mark.parametrize(
     "command",
-    ["train quick", "fine-tune --run frame", "replicate --experiment paper_frame", "latents"],
+    ["train quick", "fine-tune --run frame", "replicate paper_frame", "latents"],
 )
 @pytest.mark.parametrize("out", ["", " "])
 def test_an_empty_out_is_refused_and_never_means_this_folder(

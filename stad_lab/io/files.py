@@ -29,16 +29,16 @@ PATIENCE = 1.0 if os.name == "nt" else 0.0  # seconds that a virus scanner may h
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
     """Own a folder for a `with` block; it is made if missing, and cleared of half-written files.
 
     The operating system frees the lock when the process ends. A process may lock it repeatedly.
-    OSError if another process works in the folder, or it cannot be written to.
+    OSError if another process works in the folder for `wait` seconds, or it cannot be written to.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(folder / ".lock", timeout=0, is_singleton=True)
-        lock.acquire()
+        lock.acquire(wait)
     except Timeout:
         message = f"{folder} is in use by another process: wait for it, or choose another folder"
         raise BlockingIOError(message) from None

@@ -209,9 +209,13 @@ def finished_first(waiting: dict[Future, int], patience: float) -> set[Future]:
 
 
 def run_in_order(
-    executor: Executor, function: Callable, tasks: list[tuple], label: str | None = None
+    executor: Executor,
+    function: Callable,
+    tasks: list[tuple],
+    label: str | None = None,
+    unit: str = "episode",
 ) -> list:
-    """The results of all tasks in their order; with a progress bar if it has a label."""
+    """The results of all tasks in their order; with a progress bar of units if it has a label."""
     finished = run_tasks(executor, function, tasks)
-    results = dict(tqdm(finished, label, len(tasks), unit="episode", disable=label is None))
+    results = dict(tqdm(finished, label, len(tasks), unit=unit, disable=label is None))
     return [results[number] for number in range(len(tasks))]

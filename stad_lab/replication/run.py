@@ -104,7 +104,7 @@ def drive_baseline(name: str, folder: Path, executor: Executor | None) -> None:
         returns, lengths = zip(*run_in_order(executor, drive_blindly, tasks, name), strict=True)
     found = {"kind": KIND, "variant": name, "renderer": "none"}
     found |= report(tracks, np.array(returns), np.array(lengths))
-    made_with = provenance(f"python -m stad_lab replicate --experiment {name} --out ...")
+    made_with = provenance(f"python -m stad_lab replicate {name} --out ...")
     record = {"kind": "record", "variant": name, "made_with": made_with, "budget": {}}
     save_json(folder / RECORD, record)
     save_json(folder / EVALUATION, found | {"seconds": time.perf_counter() - begin})

@@ -3,6 +3,9 @@
 A run is named by `experiment`, `role` and `seed`. The role is "run" (CMA-ES for C, evaluated),
 "first_iteration" (of a recipe with two) or "world_model" (only V and M); the last two serve the run
 of the same seed and those after it, up to the next. C of each run is in `data/controllers`.
+
+A pipeline of a study (docs/protocol.md) is named by `study`, `variant`, `features` and `seed`, and
+has lines in the tables `study_runs`, `study_generations` and `study_episodes`.
 """
 
 import shutil
@@ -22,6 +25,7 @@ DATA = Path(__file__).parent / "data"
 TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
 UNITS = ("agents", "episodes", "frames")
 RUN = ["experiment", "role", "seed"]
+PIPELINE = ["study", "variant", "features", "seed"]
 TABLES = {  # name -> columns that name a line, and others that each line must have
     "episodes": (["experiment", "seed", "track"], ["return", "frames"]),
     "fast_episodes": (["agent", "processor", "track"], ["return", "frames"]),
@@ -32,7 +36,12 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
     "model_metrics": (["model", "world_model", "metric", "index"], ["value"]),
     "speed": (["part", "measure", "condition", "round"], ["value"]),
     "provenance": (["table", "source"], ["commit"]),
-}
+    "study_episodes": ([*PIPELINE, "track"], ["return", "length"]),
+    "study_generations": (
+        [*PIPELINE, "generation"], ["worst", "mean", "best", "sigma", "episodes", "frames"],
+    ),
+    "study_runs": (PIPELINE, ["processor", "dataset", "kept_controller"]),
+}  # fmt: skip
 
 
 def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
@@ -45,6 +54,13 @@ def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
     if (twice := table.duplicated(keys)).any():
         raise ValueError(f"{path}: more than one line for {table.loc[twice, keys].values[0]}")
     return table
+
+
+def read_study(name: str, folder: Path = DATA) -> pandas.DataFrame:
+    """The table "episodes", "generations" or "runs" of the studies, empty before the first run."""
+    if not (folder / f"study_{name}.csv").exists():
+        return pandas.DataFrame(columns=[*TABLES[f"study_{name}"][0]])
+    return read(f"study_{name}", folder)
 
 
 def episodes(folder: Path = DATA) -> pandas.DataFrame:
@@ -175,7 +191,7 @@ def add_history(network: dict, history: list[dict], to: Path) -> None:
 
 def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
     """Write a table with new lines in the place of those of the same run (and network)."""
-    run = [column for column in (*RUN, "network") if column in lines]
+    run = [column for column in TABLES[name][0] if column in (*RUN, "network", *PIPELINE)]
     if (folder / f"{name}.csv").exists():
         old = read(name, folder)
         new = pandas.MultiIndex.from_frame(lines[run])

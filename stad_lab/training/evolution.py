@@ -351,13 +351,15 @@ def drive_group(
     return episodes.returns, episodes.lengths
 
 
-def hand_out(executor: Executor, folder: Path) -> Any:
-    """What tells a worker which V and M to drive with: on this machine, their folder.
+def hand_out(executor: Executor, source: Path | WorldModel) -> Any:
+    """What tells a worker which V and M to drive with: on this machine, they or their folder.
 
     A cluster may share no disk: its executor's `share` brings V and M once to every worker.
     """
     share = getattr(executor, "share", None)
-    return share(load_world_model(folder)) if share else Path(folder)
+    if not share:
+        return source
+    return share(source if isinstance(source, WorldModel) else load_world_model(source))
 
 
 def make_agent(source: Path | WorldModel, parameters: np.ndarray) -> Agent:

@@ -118,7 +118,7 @@ def test_the_command_line_evolves_on_a_cluster(scheduler, quick_run, tmp_path):
 
 def test_the_command_line_runs_an_experiment_on_a_cluster(scheduler, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("stad_lab.replication.run.TRACKS", 3)
-    command, episodes = ["replicate", "--experiment", "constant_driver", "--out"], []
+    command, episodes = ["replicate", "constant_driver", "--out"], []
     for name, where in (("far", ["--scheduler", scheduler[0]]), ("near", [])):
         assert main([*command, str(tmp_path / name), *where]) == 0
         result = tmp_path / name / "constant_driver" / "seed0" / "evaluation.json"

@@ -246,13 +246,13 @@ def test_the_time_of_an_experiment_is_that_of_all_that_it_builds_on():
 
 def test_the_command_says_the_time_runs_a_seed_and_keeps_it(made, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(replication.keep, "__defaults__", (None, tmp_path / "data"))
-    command = ["replicate", "--experiment", "two", "--out", str(made[0])]
+    command = ["replicate", "two", "--out", str(made[0])]
     assert main([*command, "--seeds", "1"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("two: about") and "1 seeds" in lines[-1]
     assert main([*command, "--keep"]) == 0
     assert capsys.readouterr().out.splitlines() == ["kept two-0", "kept two-1"]
-    assert main(["replicate", "--experiment", "one", "--out", str(made[0]), "--keep"]) == 0
+    assert main(["replicate", "one", "--out", str(made[0]), "--keep"]) == 0
     assert "no seed is finished" in capsys.readouterr().out
 
 
@@ -264,7 +264,7 @@ def test_the_command_says_the_time_runs_a_seed_and_keeps_it(made, tmp_path, monk
     ],
 )
 def test_an_unknown_experiment_or_seed_ends_in_one_line(options, message, tmp_path, capsys):
-    assert main(["replicate", "--out", str(tmp_path), "--experiment", *options]) == 2
+    assert main(["replicate", *options, "--out", str(tmp_path)]) == 2
     assert f"error: {message}" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
 
