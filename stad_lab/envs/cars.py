@@ -214,13 +214,24 @@ def warm_up() -> None:
         if _warm:
             return
         _warm = True  # for the cars below, which come back here
-        with announced():
-            for shows in SIZES:
-                cars = Cars(1, shows)
-                cars.reset()
-                cars.place(0, 0)
-                cars.step(np.zeros((1, 3)))
-                cars.draw()
+        with announced("from stad_lab.envs import cars; cars.compile_pictures()") as others:
+            cars = Cars(1)
+            cars.reset()
+            cars.place(0, 0)
+            cars.step(np.zeros((1, 3)))
+            others.wait()
+            compile_pictures()
+
+
+def compile_pictures() -> None:
+    """Compile what paints tracks and draws pictures, or load what was compiled before."""
+    road, kinds = np.empty((0, 4, 2)), np.empty(0, np.uint8)
+    ground, out = picture.make_ground(1), np.empty((1, FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+    colors = picture.ground_colors(*np.array(list(COLORS.values()), float))
+    picture.paint(ground, 0, road, kinds, colors)
+    cars, roads = np.zeros(1, physics.CAR), np.zeros(1, physics.ROAD)
+    arrays = np.arange(1), cars, roads, np.zeros((1, MAX_TILES, 4, 2))
+    picture.draw_cars(out, ground, picture.make_pictures(), *arrays, True)
 
 
 _warming, _warm = threading.RLock(), False

@@ -3,19 +3,22 @@
 Numba keeps compiled code beside the source, or in the user's cache if the package's folder is
 read-only, or in NUMBA_CACHE_DIR. Files are replaced as a whole, so processes that compile at the
 same time do no harm. Where none of these folders can be written, we take one for temporary files.
+Numba compiles one function at a time, so a second process may compile beside this one.
 """
 
 import os
+import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numba
 from numba.core import event
 
 NOTICE = "compiling the engine, once: about 20 seconds"
+PATIENCE = 60.0  # seconds to wait for the other process
 
 
 def compiled(function: Callable | None = None, **options) -> Callable:
@@ -49,20 +52,45 @@ def use_temporary_folder() -> None:
 
 
 class Announcement(event.Listener):
-    """Prints one line to stderr when Numba begins to compile; loading from disk is no compiling."""
+    """Prints one line to stderr when Numba begins to compile; loading from disk is no compiling.
 
-    printed = False
+    Args:
+        beside: Python code that compiles, too; it is then started in another process.
+    """
+
+    def __init__(self, beside: str | None = None):
+        self.printed, self.beside, self.process = False, beside, None
 
     def on_start(self, _: event.Event) -> None:
         """Numba begins to compile a function."""
         if not self.printed:
             self.printed = True
             print(NOTICE, file=sys.stderr, flush=True)
+            if self.beside and sys.executable:
+                self.process = start_python(self.beside)
 
     def on_end(self, _: event.Event) -> None:
         """Numba has compiled a function."""
 
+    def wait(self) -> None:
+        """Wait for the other process. What it has not compiled is compiled here when needed."""
+        if self.process:
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(PATIENCE)
 
-def announced() -> AbstractContextManager:
+
+def start_python(code: str) -> subprocess.Popen:
+    """Run code in another Python with the same modules and the same folder of compiled code."""
+    same = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    if numba.config.CACHE_DIR:
+        same["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR
+    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-c", code], env=os.environ | same, **quiet)
+
+
+@contextmanager
+def announced(beside: str | None = None) -> Iterator[Announcement]:
     """Announce what is compiled within a `with` block."""
-    return event.install_listener("numba:compile", Announcement())
+    announcement = Announcement(beside)
+    with event.install_listener("numba:compile", announcement):
+        yield announcement

@@ -7,7 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from stad_lab.envs.cars import Cars, road_polygons
+from stad_lab.envs import picture
+from stad_lab.envs.cars import SIZES, Cars, compile_pictures, road_polygons
 from stad_lab.envs.frames import to_frame
 
 ACTION = np.array([0.1, 0.5, 0.0])
@@ -109,3 +110,14 @@ def test_a_kerb_is_painted_after_its_tile():
     for kerb, tile in zip(track.kerbs, track.kerb_tiles, strict=True):
         before = np.flatnonzero((polygons == track.tiles[tile]).all(axis=(1, 2)))[0]
         assert np.array_equal(polygons[before + 1], kerb)
+
+
+def test_what_is_compiled_beforehand_is_what_draws():
+    compile_pictures()
+    compiled = [len(function.signatures) for function in (picture.paint, picture.draw_cars)]
+    for shows in SIZES:
+        cars = Cars(1, shows)
+        cars.reset([0])
+        cars.draw()
+    assert compiled == [len(function.signatures) for function in (picture.paint, picture.draw_cars)]
+    assert compiled == [1, 1]
