@@ -4,9 +4,11 @@
     renderer    frames a second on one core: Gymnasium, EnvPool if it is installed, and our engine
     loop        frames a second with V + M + C driving, and where the time of a frame goes
     training    images and frames a second of V and M in training
+    run         minutes of a whole run of the laptop preset, from nothing to the evaluated agent
 
 Speeds depend on the machine, so contenders do the same work in turns, in alternating order, and the
-median of the rounds counts. It takes about ten minutes on an otherwise idle machine, on the CPU.
+median of the rounds counts. On an otherwise idle machine the run takes about twenty minutes, and
+all else about ten.
 """
 
 import cProfile
@@ -33,9 +35,10 @@ from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import FrameMemory
 from stad_lab.envs.vector import CarRacingVector
+from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.evaluation.parity import AREAS, compare_pictures
 from stad_lab.inference import Inference
-from stad_lab.io.files import save_json
+from stad_lab.io.files import load_json, save_json
 from stad_lab.io.workers import run_in_order, single_thread, worker_processes, worker_threads
 from stad_lab.models.controller import control
 from stad_lab.models.mdn_rnn import MDNRNN
@@ -43,11 +46,12 @@ from stad_lab.models.vae import VAE
 from stad_lab.training.dataset import Dataset, RandomDriver, collect
 from stad_lab.training.evolution import drive_parallel
 from stad_lab.training.mdn_rnn import Latents, mdn_rnn_training
-from stad_lab.training.pipeline import provenance
+from stad_lab.training.pipeline import RECORD, STAGES, provenance, train
 from stad_lab.training.trainer import Training, read_ahead, update
 from stad_lab.training.vae import vae_training
 
-SOURCE = "input"  # the shipped agent that drives
+SOURCE = "input"  # the shipped agent that drives, and the variant that is trained
+PRESET = "laptop"  # of the whole run
 GYMNASIUM, ENVPOOL = "Gymnasium", "EnvPool"
 CARS = 16  # in a batch
 V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, the first of them not timed
@@ -59,7 +63,7 @@ def benchmark(parts: list[str], rounds: int = 5, file: Path | None = None) -> di
     """Run some parts of the benchmark and print their tables.
 
     Args:
-        parts: of "parity", "renderer", "loop", "training".
+        parts: of "parity", "renderer", "loop", "training", "run".
         rounds: how often the contenders take turns.
         file: where to write the result, after every part; None for nowhere.
 
@@ -295,9 +299,26 @@ def training_speed(training: Training, items: int) -> float:
     return (training.steps - WARM_UP) * items / (time.perf_counter() - begin)
 
 
+def measure_run(rounds: int) -> dict:
+    """One whole run, and the evaluation of its agent on 100 tracks with either renderer."""
+    config = Config.preset(PRESET, variant=SOURCE)
+    with tempfile.TemporaryDirectory() as folder:
+        begin = time.perf_counter()
+        train(config, folder)
+        seconds = load_json(Path(folder) / RECORD)["seconds"]
+        seconds = {stage: seconds[stage] for stage in STAGES}
+        seconds["all else"] = time.perf_counter() - begin - sum(seconds.values())
+        for fast, name in ((True, "our engine"), (False, GYMNASIUM)):
+            begin = time.perf_counter()
+            evaluate(folder, fast=fast, processes=config.processes)
+            seconds[f"evaluation with {name}"] = time.perf_counter() - begin
+    return {"minutes of a whole run": {name: own / 60 for name, own in seconds.items()}}
+
+
 PARTS = {
     "parity": measure_parity,
     "renderer": measure_renderer,
     "loop": measure_loop,
     "training": measure_training,
+    "run": measure_run,
 }

@@ -72,7 +72,8 @@ def test_both_renderers_are_compared_frame_by_frame(number):
 
 
 @pytest.mark.long
-def test_the_whole_benchmark_runs_to_its_end(tmp_path):
+def test_the_whole_benchmark_runs_to_its_end(tmp_path, monkeypatch):
+    monkeypatch.setattr("stad_lab.benchmark.PRESET", "quick")
     file = tmp_path / "benchmark.json"
     assert main(["benchmark", "--rounds", "1", "--json", str(file)]) == 0
     assert {"made_with", "rounds", *PARTS} <= load_json(file).keys()
