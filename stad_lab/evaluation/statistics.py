@@ -8,6 +8,7 @@ from scipy import stats
 SOLVED = 900  # points; CarRacing counts as solved at a mean return of 900 over 100 tracks
 FAILED = 800  # points; an episode below has left the road or missed tiles
 RESAMPLES = 10_000  # of a bootstrap
+CHUNK = 100  # resamples that are in memory together
 
 
 def summarise(returns: np.ndarray) -> dict:
@@ -48,25 +49,18 @@ def bootstrap_difference(before: np.ndarray, after: np.ndarray) -> list[float]:
 
 
 def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generator, np.ndarray]:
-    """The Generator of a bootstrap, and the tracks of each resample, int (resamples, tracks)."""
+    """The Generator of a bootstrap, and the tracks of each resample, int (resamples, 1, tracks)."""
     rng, tracks = np.random.default_rng(0), returns.shape[1]
-    return rng, rng.integers(tracks, size=(resamples, tracks))
+    return rng, rng.integers(tracks, size=(resamples, 1, tracks))
 
 
 def resampled_means(
     returns: np.ndarray, rng: np.random.Generator, tracks: np.ndarray
 ) -> np.ndarray:
     """The mean return of each resample, float64 (resamples,); seeds are drawn here."""
-    seeds = rng.integers(len(returns), size=(len(tracks), len(returns)))
-    by_seed = shares(tracks, returns.shape[1]) @ returns.T  # (resamples, seeds)
-    return (shares(seeds, len(returns)) * by_seed).sum(axis=1)
-
-
-def shares(drawn: np.ndarray, count: int) -> np.ndarray:
-    """How often each of `count` items is in a row of `drawn` (rows, n), relative to n."""
-    places = drawn + count * np.arange(len(drawn))[:, None]
-    times = np.bincount(places.ravel(), minlength=count * len(drawn))
-    return times.reshape(len(drawn), count) / drawn.shape[1]
+    seeds = rng.integers(len(returns), size=(len(tracks), len(returns), 1))
+    rows = [slice(start, start + CHUNK) for start in range(0, len(tracks), CHUNK)]
+    return np.concatenate([returns[seeds[own], tracks[own]].mean(axis=(1, 2)) for own in rows])
 
 
 def middle_95(samples: np.ndarray) -> list[float]:
