@@ -93,7 +93,7 @@ def comparisons_table(study: dict) -> str:
             arm = f"{features}: {variant}"
             one, arms = study["comparisons"][arm], study["arms"]
             means = [f"{arms[name]['mean']:.0f}" for name in (f"{features}: frame", arm)]
-            p = [f"{one[key]:.3f}" for key in ("p", "holm_p")]
+            p = [p_value(one[key]) for key in ("p", "holm_p")]
             outcome = one["verdict"]
             if outcome == "undecided":
                 outcome += f": {one['seeds_that_decide']} seeds would decide"
@@ -102,6 +102,11 @@ def comparisons_table(study: dict) -> str:
             lines.append((family, name, pipelines, *means, difference_of(one), *p, outcome))
     head = ("test", "variant", "pairs", "`frame`", "variant", "difference", "p", "Holm's p")
     return table((*head, "verdict"), lines)
+
+
+def p_value(p: float) -> str:
+    """Three decimals, or that it is smaller."""
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
 
 
 def outcomes_table(study: dict) -> str:
@@ -122,7 +127,7 @@ def outcomes_table(study: dict) -> str:
         cells = (name, f"{one['below_800']:.1%}", *scores, difference_of(faster) if faster else "")
         lines.append(cells)
     head = ("arm", "below 800", "interquartile mean", "10th percentile", "minimum")
-    return table((*head, "height of the learning curve", "less `frame`"), lines)
+    return table((*head, "area under the learning curve", "less `frame`"), lines)
 
 
 def study3(claims: dict) -> str:

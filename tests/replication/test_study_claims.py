@@ -1,6 +1,8 @@
 """The statistics of the studies, on synthetic tables, against SciPy and known answers."""
 
 import itertools
+import sys
+from pathlib import Path
 
 import numpy as np
 import pandas
@@ -12,6 +14,9 @@ from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.replication import study_claims, tables
 from stad_lab.replication.study import STUDIES, find_pipelines
 from stad_lab.replication.study_claims import FEATURES, describe_study1, describe_study3
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+import blocks
 
 GAIN = {"frame": 0, "input": 5, "output": -60, "input_output": 40}  # points, and a speed
 TRACKS, SEEDS = 400, 12
@@ -155,6 +160,25 @@ def test_nothing_is_tested_before_the_last_pipeline_is_there(full, tmp_path):
         "complete_seeds": 11, "planned_seeds": 12, "pipelines": 95, "planned_pipelines": 96,
     }  # fmt: skip
     assert describe_study1(tmp_path / "empty")["pipelines"] == 0
+
+
+def test_the_page_has_the_progress_until_the_last_seed_and_then_every_result(found):
+    study3 = {"seeds": 0, "planned_seeds": 12, "networks": 0}
+    progress = {"complete_seeds": 3, "planned_seeds": 12, "pipelines": 29, "planned_pipelines": 96}
+    claims = {"study1": progress, "study3": study3}
+    assert "3 of 12 seeds are complete" in blocks.study1(claims) and not blocks.study_figures(
+        claims
+    )
+    claims["study1"] = found
+    page = blocks.study1(claims)
+    for name, one in found["comparisons"].items():
+        features, variant = name.split(": ")
+        line = next(
+            line for line in page.splitlines() if f"`{variant}`, {blocks.SEEN[features]} |" in line
+        )
+        assert blocks.difference_of(one) in line and blocks.p_value(one["holm_p"]) in line
+        assert f"| {one['verdict']} |" in line
+    assert page.count("](../notebooks/pictures/study1") == len(blocks.study_figures(claims)) == 2
 
 
 def test_a_pipeline_without_all_its_episodes_is_refused(full, tmp_path):
