@@ -12,7 +12,16 @@ from gallery import CELLS, PICTURES
 from PIL import Image
 
 from stad_lab import cli, config
-from stad_lab.viz.replication import CONDITIONS, difference_of, plot_forest
+from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
+from stad_lab.viz.replication import (
+    CONDITIONS,
+    SEEN,
+    difference_of,
+    plot_forest,
+    plot_learning_curves,
+    plot_representation,
+    plot_study,
+)
 
 PACKAGE = Path(config.__file__).parent
 PRETRAINED = PACKAGE / "pretrained"
@@ -63,6 +72,102 @@ def verdict(found: dict) -> str:
     if not found["baseline_passes"]:
         return "inconclusive: baseline fails"
     return found["outcome"] if found["has_room"] else "inconclusive: ceiling"
+
+
+def study1(claims: dict) -> str:
+    """Study 1: its progress, and after the last seed its tables and figures."""
+    found = claims["study1"]
+    if "comparisons" not in found:
+        seeds = "{complete_seeds} of {planned_seeds} seeds"
+        text = f"**{seeds} are complete** ({{pipelines}} of {{planned_pipelines}} pipelines)."
+        return f"{text} Nothing is tested before the last one.".format(**found)
+    parts = [comparisons_table(found), outcomes_table(found)]
+    return "\n\n".join([*parts, *(image(name, study_figures(claims)) for name in STUDY1_FIGURES)])
+
+
+def comparisons_table(study: dict) -> str:
+    """The tests of study 1."""
+    lines = []
+    for family, variants in FAMILIES.items():
+        for features, variant in itertools.product(FEATURES, variants):
+            arm = f"{features}: {variant}"
+            one, arms = study["comparisons"][arm], study["arms"]
+            means = [f"{arms[name]['mean']:.0f}" for name in (f"{features}: frame", arm)]
+            p = [p_value(one[key]) for key in ("p", "holm_p")]
+            outcome = one["verdict"]
+            if outcome == "undecided":
+                outcome += f": {one['seeds_that_decide']} seeds would decide"
+            name = f"`{variant}`, {SEEN[features]}"
+            pipelines = str(len(one["by_seed"]))
+            lines.append((family, name, pipelines, *means, difference_of(one), *p, outcome))
+    head = ("test", "variant", "pairs", "`frame`", "variant", "difference", "p", "Holm's p")
+    return table((*head, "verdict"), lines)
+
+
+def p_value(p: float) -> str:
+    """Three decimals, or that it is smaller."""
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
+
+
+def outcomes_table(study: dict) -> str:
+    """The secondary outcomes of the arms of study 1."""
+    lines = []
+    for features, variant in itertools.product(FEATURES, config.VARIANTS):
+        one = study["arms"][f"{features}: {variant}"]
+        points = ("interquartile_mean", "tenth_percentile", "minimum", "area")
+        scores = [f"{one[key]:.0f}" for key in points]
+        compared = study["comparisons"].get(f"{features}: {variant}")
+        faster = {}
+        if compared:
+            faster = {
+                "difference": compared["area_difference"],
+                "interval": compared["area_interval"],
+            }
+        name = f"`{variant}`, {SEEN[features]}"
+        cells = (name, f"{one['below_800']:.1%}", *scores, difference_of(faster) if faster else "")
+        lines.append(cells)
+    head = ("arm", "below 800", "interquartile mean", "10th percentile", "minimum")
+    return table((*head, "area under the learning curve", "less `frame`"), lines)
+
+
+def study3(claims: dict) -> str:
+    """Study 3: R2 from z, and in brackets from z and h, means over the seeds so far."""
+    found = claims["study3"]
+    text = "{seeds} of {planned_seeds} seeds are probed ({networks} V networks).".format(**found)
+    if not (names := [name for name in found if name.startswith("agent: ")]):
+        return text
+    order = sorted(names, key=lambda name: ("untrained" in name, len(name)))
+    lines = [(f"`{name[7:]}`".replace(", untrained`", "`, untrained"),
+              *(r2_cell(found[name], quantity) for quantity in QUANTITIES))
+             for name in order]  # fmt: skip
+    picture = image("study3", study_figures(claims))
+    return "\n\n".join([text, table(("V", *QUANTITIES), lines), picture])
+
+
+def r2_cell(found: dict, quantity: str) -> str:
+    """The mean of R2 from z with its interval, and in brackets that from z and h."""
+    alone, both = (found[features][quantity] for features in FEATURES)
+    low, high = (fixed(bound) for bound in alone["interval"])
+    return f"{fixed(alone['mean'])}, {low} to {high} ({fixed(both['mean'])})"
+
+
+STUDY1_FIGURES = ("study1", "study1_curves")
+
+
+def study_figures(claims: dict) -> dict:
+    """The figures of the studies for which there is data: name of the file -> Figure."""
+    one, three, figures = claims["study1"], claims["study3"], {}
+    if "comparisons" in one:
+        drawn = plot_study(one["comparisons"], MARGIN), plot_learning_curves(one["curves"])
+        figures |= dict(zip(STUDY1_FIGURES, drawn, strict=True))
+    if three["seeds"] > 1:
+        figures["study3"] = plot_representation(three)
+    return figures
+
+
+def image(name: str, figures: dict) -> str:
+    """A figure in Markdown, for a page in docs."""
+    return f"![{figures[name].get_label()}](../notebooks/pictures/{name}.png)"
 
 
 def experiments_table(claims: dict) -> str:
@@ -305,6 +410,8 @@ def forest(claims: dict):
 BLOCKS: dict[str, Callable[[dict], str]] = {
     "agents": agents_table,
     "results": results_table,
+    "study1": study1,
+    "study3": study3,
     "representation": representation_table,
     "representation of turning": lambda claims: representation_table(claims, QUANTITIES[1:4]),
     "latents, agent": lambda claims: latents_table(claims, "agent"),

@@ -12,7 +12,7 @@ import re
 import sys
 from pathlib import Path
 
-from blocks import BLOCKS, NUMBERS, forest
+from blocks import BLOCKS, NUMBERS, forest, study_figures
 from gallery import PICTURES
 
 from stad_lab.viz.plots import to_png
@@ -60,7 +60,7 @@ def stale(claims: dict) -> dict[Path, str]:
 
 
 def main() -> int:
-    """Renew the pages and the figure, or check the pages: the exit status is 1 if one is stale."""
+    """Renew the pages and the figures, or check the pages: the exit status is 1 if one is stale."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="change nothing, name stale pages")
     check = parser.parse_args().check
@@ -72,6 +72,8 @@ def main() -> int:
             file.write_text(text, encoding="utf-8")
     if not check:
         FOREST.write_bytes(to_png(forest(claims)))
+        for name, figure in study_figures(claims).items():
+            (PICTURES / f"{name}.png").write_bytes(to_png(figure))
     return int(check and bool(found))
 
 

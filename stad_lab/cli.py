@@ -18,7 +18,14 @@ import tyro
 
 from stad_lab.config import PRESETS, Config
 
-CONTINUES = ("train", "fine-tune", "evaluate", "replicate", "latents")  # after an interrupt
+CONTINUES = (
+    "train",
+    "fine-tune",
+    "evaluate",
+    "replicate",
+    "latents",
+    "probe-study",
+)  # after an interrupt
 PROGRAM = "python -m stad_lab"
 # Packages that a few commands need, and the extras that bring them.
 EXTRAS = {"matplotlib": "lab", "PIL": "lab", "distributed": "cluster", "envpool": "benchmark"}
@@ -350,6 +357,39 @@ def evaluate_study(
                 save_json(json, {"kind": "study", "study": study, "agents": found})
 
 
+def probe_study(
+    study: tyro.conf.Positional[str], seeds: list[int] | None = None, processes: int = 2
+) -> None:
+    """Probe the kept V and M of a study's complete seeds, and add the results to the tables.
+
+    Stop it when you like; the same command continues.
+
+    Args:
+        study: Its name, such as study1.
+        seeds: Some of its seeds; all complete ones if not given.
+        processes: Worker processes.
+    """
+    from stad_lab.replication.study_probe import probe_study
+
+    probed = probe_study(study, seeds, processes=processes)
+    print(f"probed the seeds {probed}" if probed else "no further seed is complete: nothing to do")
+
+
+def archive_study(study: tyro.conf.Positional[str], out: str) -> None:
+    """Pack the kept agents of a study that the repository does not hold, for a release.
+
+    Args:
+        study: Its name, such as study1.
+        out: The archive, for example study1-networks.zip.
+    """
+    from stad_lab.io.files import check_writable
+    from stad_lab.replication.study import archive_study
+
+    file = output(out)
+    check_writable(file)
+    print(f"packed {archive_study(study, file)} files into {file}")
+
+
 def claims() -> None:
     """Compute every statistic of the replication from its tables, and write claims.json."""
     from stad_lab.replication.claims import write_claims
@@ -471,6 +511,8 @@ COMMANDS: dict[str, Callable] = {
     "verify": verify,
     "replicate": replicate,
     "evaluate-study": evaluate_study,
+    "probe-study": probe_study,
+    "archive-study": archive_study,
     "claims": claims,
     "probe": probe,
     "latents": latents,

@@ -8,6 +8,7 @@ from scipy import stats
 SOLVED = 900  # points; CarRacing counts as solved at a mean return of 900 over 100 tracks
 FAILED = 800  # points; an episode below has left the road or missed tiles
 RESAMPLES = 10_000  # of a bootstrap
+CHUNK = 100  # resamples that are in memory together
 
 
 def summarise(returns: np.ndarray) -> dict:
@@ -35,7 +36,8 @@ def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     """95% interval of the mean of returns (seeds, tracks), resampling seeds and tracks.
 
     A track is drawn for all seeds together. With fewer than five seeds the interval is too narrow;
-    with one it holds the variance between tracks alone.
+    with one it holds the variance between tracks alone. Of paired differences, it is an interval
+    of the mean difference.
     """
     return middle_95(resampled_means(returns, *draw_tracks(returns, resamples)))
 
@@ -57,7 +59,8 @@ def resampled_means(
 ) -> np.ndarray:
     """The mean return of each resample, float64 (resamples,); seeds are drawn here."""
     seeds = rng.integers(len(returns), size=(len(tracks), len(returns), 1))
-    return returns[seeds, tracks].mean(axis=(1, 2))
+    rows = [slice(start, start + CHUNK) for start in range(0, len(tracks), CHUNK)]
+    return np.concatenate([returns[seeds[own], tracks[own]].mean(axis=(1, 2)) for own in rows])
 
 
 def middle_95(samples: np.ndarray) -> list[float]:
@@ -80,3 +83,45 @@ def pooled_interval(groups: Sequence[Sequence[float]], before: int, after: int) 
     error = np.sqrt(variance * (1 / len(groups[before]) + 1 / len(groups[after])))
     difference = np.mean(groups[after]) - np.mean(groups[before])
     return [float(difference + t * error) for t in stats.t.ppf([0.025, 0.975], free)]
+
+
+def paired_p(differences: Sequence[float]) -> float:
+    """Two-sided p-value of the paired t-test, from the difference of each pair."""
+    return float(stats.ttest_1samp(differences, 0.0).pvalue)
+
+
+def mean_interval(values: Sequence[float]) -> list[float]:
+    """95% interval of the mean of at least two values, by Student's t."""
+    error = stats.sem(values)
+    return [
+        float(np.mean(values) + t * error) for t in stats.t.ppf([0.025, 0.975], len(values) - 1)
+    ]
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """P-values adjusted for their number, after Holm (1979), in the given order."""
+    adjusted, largest = np.empty(len(p_values)), 0.0
+    for rank, place in enumerate(np.argsort(p_values)):
+        largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[place]))
+        adjusted[place] = largest
+    return adjusted.tolist()
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Mean of the values without the lowest and the highest quarter."""
+    return float(stats.trim_mean(values, 0.25, axis=None))
+
+
+def pairs_that_decide(deviation: float, margin: float, tests: int) -> int:
+    """The smallest number of pairs, at least 2, whose paired t-test is sure to decide.
+
+    Whatever the mean: either Holm's p over so many tests is below 0.05, or the 95% interval lies
+    within +-margin. If p is not, the mean is within the wider half-width of the level 0.05 / tests,
+    and the end of the interval is further by the half-width of 95%: both together must fit into the
+    margin. `deviation`: of the paired differences.
+    """
+    for pairs in range(2, 100_000):
+        both = stats.t.ppf([0.975, 1 - 0.025 / tests], pairs - 1).sum()
+        if both * deviation / np.sqrt(pairs) <= margin:
+            return pairs
+    raise ValueError(f"deviation={deviation}: expected a finite number below {100 * margin:.0f}")

@@ -14,7 +14,7 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.config import VARIANTS
 from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
-from stad_lab.replication import measurements, tables
+from stad_lab.replication import measurements, study_claims, tables
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS, RECIPES
 from stad_lab.training.pipeline import total_budget
 
@@ -41,6 +41,8 @@ def compute_claims() -> dict[str, dict]:
     yaw_rate = measurements.yaw_rate_of_z(probe)
     return {
         "verdict": find_verdict(recipes, float(episodes["return"].max()), yaw_rate),
+        "study1": study_claims.describe_study1(),
+        "study3": study_claims.describe_study3(),
         "paper": {"table": PAPER, "others": PAPER_OTHERS, "best": PAPER_BEST},
         "world_models": {f"{count}_episodes": score for count, score in WORLD_MODELS.items()},
         "agents": describe_agents(),

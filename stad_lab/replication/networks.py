@@ -1,5 +1,8 @@
 """The trained agents of a study, kept in half precision: what driving needs of V, M and C.
 
+The repository holds those of the seeds IN_GIT. `archive` puts the others into one file for a
+release.
+
 In the folder of a study::
 
     seed0/frame/world_model.safetensors   V's encoder and M's LSTM
@@ -11,6 +14,9 @@ them, so that anyone can drive it again.
 """
 
 import dataclasses
+import io
+import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +24,7 @@ import torch
 
 from stad_lab.agent import Agent
 from stad_lab.config import Config
-from stad_lab.io.files import load_into, save_tensors
+from stad_lab.io.files import checksum, load_into, save_tensors, write_bytes
 from stad_lab.io.weights import (
     WorldModel,
     check_belongs,
@@ -31,6 +37,7 @@ from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 
 NETWORKS = Path(__file__).parent / "networks"  # in the repository, not in what pip installs
+IN_GIT = range(6)  # seeds of study1: all twelve would need 50 MB
 WORLD_MODEL_FILE = "world_model.safetensors"
 KIND = "driving world model"
 DRIVES = {"vae": "encoder.", "mdn_rnn": "lstm."}  # the part of each network that driving needs
@@ -79,3 +86,31 @@ def load_kept_agent(path: Path) -> Agent:
     parameters, metadata = load_controller(path)
     check_belongs(path, metadata, **world_model.checksums)
     return Agent(world_model, parameters)
+
+
+def where_to_get(study: str) -> str:
+    """What to do about kept agents that are not there, for a message."""
+    name = archive_name(study)
+    return f"run the study, or unpack {name} of the project's release into {NETWORKS}"
+
+
+def archive_name(study: str) -> str:
+    """The name of a study's archive in a release."""
+    return f"{study}-networks.zip"
+
+
+def archive(out: Path, files: Iterable[tuple[Path, str]], folder: Path = NETWORKS) -> int:
+    """Write kept files (path, its checksum) of `folder` into a zip archive; returns their number.
+
+    The same files give the same archive, byte by byte. ValueError if one has another checksum.
+    """
+    packed, count = io.BytesIO(), 0
+    with zipfile.ZipFile(packed, "w") as pack:
+        for path, expected in files:
+            content = path.read_bytes()
+            if checksum(content) != expected:
+                raise ValueError(f"{path} is not the file of the recorded run")
+            pack.writestr(zipfile.ZipInfo(path.relative_to(folder).as_posix()), content)
+            count += 1
+    write_bytes(out, packed.getvalue())
+    return count

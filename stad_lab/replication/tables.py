@@ -5,7 +5,8 @@ A run is named by `experiment`, `role` and `seed`. The role is "run" (CMA-ES for
 of the same seed and those after it, up to the next. C of each run is in `data/controllers`.
 
 A pipeline of a study (docs/protocol.md) is named by `study`, `variant`, `features` and `seed`, and
-has lines in the tables `study_runs`, `study_generations` and `study_episodes`.
+has lines in the tables `study_runs`, `study_generations` and `study_episodes`. What its V carries
+is in `study_probe`.
 """
 
 import shutil
@@ -41,6 +42,7 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
         [*PIPELINE, "generation"], ["worst", "mean", "best", "sigma", "episodes", "frames"],
     ),
     "study_runs": (PIPELINE, ["processor", "dataset", "kept_controller"]),
+    "study_probe": ([*PIPELINE, "trained", "driver", "quantity"], ["r2"]),
 }  # fmt: skip
 
 
@@ -57,7 +59,7 @@ def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
 
 
 def read_study(name: str, folder: Path = DATA) -> pandas.DataFrame:
-    """The table "episodes", "generations" or "runs" of the studies, empty before the first run."""
+    """The table "episodes", "generations", "runs" or "probe" of the studies, empty if not there."""
     if not (folder / f"study_{name}.csv").exists():
         return pandas.DataFrame(columns=[*TABLES[f"study_{name}"][0]])
     return read(f"study_{name}", folder)

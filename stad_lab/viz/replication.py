@@ -1,9 +1,20 @@
-"""The figure of the replication: each recipe's differences to `frame`, with a dot for each run."""
+"""The figures of the replication: of the earlier recipes, and of the studies of the protocol."""
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stad_lab.viz.plots import BLUE, GREEN, RED, new_figure
+from stad_lab.viz.plots import (
+    BLUE,
+    DASHES,
+    GREEN,
+    RED,
+    caption,
+    describe,
+    legend_below,
+    name_rows,
+    new_figure,
+    plot_intervals,
+)
 
 CONDITIONS = {
     "paper": "1. Paper's recipe, indicator bar cropped",
@@ -12,6 +23,9 @@ CONDITIONS = {
     "fine_tuned": "4. As 3 with fine-tuning",
 }
 COLOURS = {"frame": "#555555", "input": BLUE, "output": RED, "input_output": GREEN}
+SEEN = {"z": "C sees z", "z, h": "C sees z and h"}
+SOURCES = {"z": "z", "z, h": "z and h"}
+TURNING = ("slip speed", "yaw rate", "wheel angle")  # what a single frame does not show
 PAPER_LEAD = 75  # of `input_output`, the smallest of the three that the paper reports
 
 
@@ -86,3 +100,97 @@ def difference_of(one: dict) -> str:
 def signed(number: float) -> str:
     """A rounded number with its sign, and 0 without."""
     return f"{round(number):+d}" if round(number) else "0"
+
+
+def plot_study(comparisons: dict[str, dict], margin: float) -> Figure:
+    """The forest plot of study 1: each pipeline less `frame` of its seed, and the mean of these.
+
+    Args:
+        comparisons: "FEATURES: VARIANT" -> "difference", "interval", "by_seed" and "verdict".
+        margin: differences within +-margin, in points, are not relevant.
+    """
+    variants = [variant for variant in COLOURS if variant != "frame"]
+    figure, axes = new_figure(8.0, 4.6, 2, 1, sharex=True)
+    for axis, (features, title) in zip(axes[:, 0], SEEN.items(), strict=True):
+        axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
+        axis.axvline(0, color="black", linewidth=0.8)
+        axis.axvline(PAPER_LEAD, color="black", linestyle="--", label=f"paper: +{PAPER_LEAD}")
+        for height, variant in enumerate(variants):
+            plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
+        name_rows(axis, variants)
+        axis.set_title(title, loc="left", fontsize=10)
+    axes[1, 0].set_xlabel("difference of the mean return to frame of the same seed, points")
+    handles = {name: one for one, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=9)
+    told = [
+        f"{SEEN[features]}, {variant} {difference_of(one)}, {one['verdict']}"
+        for features in SEEN
+        for variant in variants
+        for one in [comparisons[f"{features}: {variant}"]]
+    ]
+    pairs = len(comparisons["z: input"]["by_seed"])
+    lead = f"Mean differences with 95% intervals, and a dot for each of {pairs} seeds: "
+    return describe(figure, "Study 1: variants less frame", lead, ["; ".join(told)])
+
+
+def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:
+    """A line of a forest plot: the interval and the mean, and above them the seeds."""
+    seeds = {"markerfacecolor": "white", "markeredgecolor": colour, "linestyle": "none"}
+    axis.plot(
+        one["interval"], [height] * 2, color=colour, linewidth=2.5, label="mean, 95% interval"
+    )
+    axis.plot(one["difference"], height, "D", color=colour, markersize=7)
+    places = [height - 0.27] * len(one["by_seed"])
+    axis.plot(one["by_seed"], places, "o", markersize=5, label="one pipeline", **seeds)
+
+
+def plot_learning_curves(curves: dict[str, dict]) -> Figure:
+    """Validation means of study 1 against all episodes driven, with bands over seeds.
+
+    Args:
+        curves: "FEATURES: VARIANT" -> "episodes", "mean", "low" and "high".
+    """
+    figure, axes = new_figure(8.6, 4.0, 1, 2, sharex=True, sharey=True)
+    for axis, (features, title) in zip(axes[0], SEEN.items(), strict=True):
+        for (variant, colour), dash in zip(COLOURS.items(), DASHES, strict=True):
+            one = curves[f"{features}: {variant}"]
+            axis.fill_between(one["episodes"], one["low"], one["high"], color=colour, alpha=0.15)
+            axis.plot(one["episodes"], one["mean"], dash, color=colour, label=variant)
+        caption(axis, title, "episodes, those of the dataset included")
+    axes[0, 0].set_ylabel("validation mean")
+    legend_below(figure, axes[0, 0])
+    ends = [f"{SEEN[arm.split(':')[0]]}, {arm.split(': ')[1]} {one['mean'][-1]:.0f}"
+            for arm, one in curves.items()]  # fmt: skip
+    title = "Study 1: learning curves, mean of the seeds with its 95% interval"
+    return describe(figure, title, "At the end: ", ends)
+
+
+def plot_representation(study3: dict, driver: str = "agent") -> Figure:
+    """R2 of the probe over all V networks of study 1, and of untrained ones, by quantity.
+
+    Args:
+        study3: "DRIVER: VARIANT" -> features -> quantity -> "mean", "interval" and "values".
+        driver: "agent" or "random_driver".
+    """
+    start = f"{driver}: "
+    rows = {name.removeprefix(start): one for name, one in study3.items() if name.startswith(start)}
+    rows = dict(sorted(rows.items(), key=lambda row: (", untrained" in row[0], len(row[0]))))
+    parts = "mean", "interval", "values"
+    panels = {
+        quantity: {
+            row: {
+                f"from {SOURCES[f]}": tuple(by[quantity][part] for part in parts)
+                for f, by in found.items()
+            }
+            for row, found in rows.items()
+        }
+        for quantity in next(iter(rows.values()))["z"]
+    }
+    title = f"Study 3: what {study3['networks']} V networks carry, a line for each"
+    figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
+    told = [
+        f"{quantity} of {row} {panels[quantity][row]['from z'][0]:.2f}"
+        for quantity in TURNING
+        for row in rows
+    ]
+    return describe(figure, title, "Mean R2 from z: ", told)

@@ -3,15 +3,17 @@
 import shutil
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from stad_lab.cli import main
 from stad_lab.config import TRACK_RANGES, Config, track_seeds
+from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.io.files import load_json, load_tensors
 from stad_lab.io.weights import CONTROLLER_FILE, VAE_FILE, load_controller
-from stad_lab.replication import study, tables
+from stad_lab.replication import latents, study, study_probe, tables
 from stad_lab.replication.networks import WORLD_MODEL_FILE, load_kept_agent
 from stad_lab.replication.study import (
     SCORE,
@@ -22,6 +24,7 @@ from stad_lab.replication.study import (
     find_pipelines,
     run_study,
 )
+from stad_lab.replication.study_probe import probe_study
 from stad_lab.training.dataset import Dataset
 from stad_lab.training.evolution import LOG, crc
 from stad_lab.training.pipeline import RECORD
@@ -187,7 +190,7 @@ def test_kept_agents_are_driven_on_any_tracks_by_one_command(made, tmp_path, mon
     agents = load_json(tmp_path / "found.json")["agents"]
     assert [one["track"] for one in agents["seed0/frame/z"]["episodes"]] == [5000, 5001]
     assert main([*command, "--seeds", "1"]) == 2
-    assert "has no agents of these seeds" in capsys.readouterr().err
+    assert "unpack tiny-networks.zip of the project's release" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -210,6 +213,46 @@ def test_the_remaining_time_is_that_of_the_missing_stages(made):
     hours = seconds @ [1, 2, 2, 4, 4] / 3600
     expected = f"4 of 8 pipelines are done, about {hours:.1f} hours are left"
     assert study.describe_progress("tiny", wanted, made / "data") == expected
+
+
+def test_v_and_m_of_a_complete_seed_are_probed_once_with_untrained_controls(
+    made, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(latents, "AGENT_FRAMES", 100)
+    monkeypatch.setattr(latents, "worker_threads", lambda count: ThreadPoolExecutor(1))
+    shutil.copytree(made / "data", tmp_path / "data")
+    given = {"to": tmp_path / "data", "networks": made / "networks", "trajectories": 12}
+    assert probe_study("tiny", **given) == [0]
+    table = tables.read_study("probe", tmp_path / "data")
+    assert len(table) == 2 * 4 * 2 * len(MOTION)  # drivers, networks, features, quantities
+    assert set(table.variant) == set(VARIANTS) and table.r2.nunique() == len(table)
+    monkeypatch.setattr(study_probe, "random_trajectories", lambda *given: pytest.fail("again"))
+    assert probe_study("tiny", **given) == []
+    file = shutil.copytree(made / "networks", tmp_path / "networks") / "tiny/seed0/frame"
+    (file / WORLD_MODEL_FILE).write_bytes(b"another")
+    given["networks"] = tmp_path / "networks"
+    with pytest.raises(ValueError, match="not the file of the recorded run"):
+        probe_study("tiny", **given | {"to": made / "data"})
+
+
+def test_the_networks_that_git_does_not_hold_go_into_an_archive(made, tmp_path, monkeypatch):
+    given = {"to": made / "data", "networks": made / "networks"}
+    with pytest.raises(ValueError, match="tiny has no recorded agents but those of"):
+        study.archive_study("tiny", tmp_path / "none.zip", **given)
+    monkeypatch.setattr(study, "IN_GIT", range(0))
+    files = [tmp_path / name for name in ("one.zip", "two.zip")]
+    assert [study.archive_study("tiny", file, **given) for file in files] == [6, 6]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    shutil.unpack_archive(files[0], tmp_path / "unpacked")
+    (_, result), *others = evaluate_kept(
+        "tiny", range(1000, 1001), only=["seed0/frame/z"], networks=tmp_path / "unpacked"
+    )
+    assert not others and len(result["episodes"]) == 1
+    shutil.copytree(made / "networks", tmp_path / "networks")
+    (tmp_path / "networks/tiny/seed0/frame/z.safetensors").write_bytes(b"another")
+    with pytest.raises(ValueError, match="not the file of the recorded run"):
+        study.archive_study("tiny", tmp_path / "bad.zip", made / "data", tmp_path / "networks")
+    assert not (tmp_path / "bad.zip").exists()
 
 
 def test_a_seed_that_another_process_runs_is_left_to_it(made, tmp_path, capsys):

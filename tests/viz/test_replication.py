@@ -1,0 +1,65 @@
+"""Figures of the studies: every seed is drawn, and the alternative text holds the results."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from stad_lab.config import VARIANTS
+from stad_lab.evaluation.trajectories import MOTION
+from stad_lab.replication.study_claims import FEATURES, MARGIN
+from stad_lab.viz.replication import plot_learning_curves, plot_representation, plot_study
+
+
+@pytest.fixture
+def comparisons():
+    """Three variants with both features, of four seeds."""
+    names = [f"{features}: {variant}" for features in FEATURES for variant in VARIANTS[1:]]
+    return {
+        name: {
+            "difference": 10.0 * place,
+            "interval": [10.0 * place - 8, 10.0 * place + 8],
+            "by_seed": [10.0 * place + seed for seed in (-3, -1, 1, 3)],
+            "verdict": "undecided",
+        }
+        for place, name in enumerate(names)
+    }
+
+
+def test_the_forest_plot_has_a_dot_for_each_pipeline_and_a_line_at_the_gain_of_the_paper(
+    comparisons,
+):
+    figure = plot_study(comparisons, MARGIN)
+    for axis, features in zip(figure.axes, FEATURES, strict=True):
+        drawn = [list(line.get_xdata()) for line in axis.lines]
+        for variant in VARIANTS[1:]:
+            one = comparisons[f"{features}: {variant}"]
+            assert one["by_seed"] in drawn and one["interval"] in drawn
+        assert [75, 75] in drawn
+    label = figure.get_label()
+    assert "a dot for each of 4 seeds" in label
+    assert "C sees z and h, input_output +50 (42 to 58), undecided" in label
+
+
+def test_learning_curves_have_a_band_over_the_seeds():
+    curve = {"episodes": [900, 1200], "mean": [100.0, 800.0], "low": [50, 700], "high": [150, 900]}
+    arms = itertools.product(FEATURES, VARIANTS)
+    figure = plot_learning_curves({f"{features}: {variant}": curve for features, variant in arms})
+    for axis in figure.axes:
+        assert len(axis.lines) == len(axis.collections) == 4
+        low = axis.collections[0].get_paths()[0].vertices
+        assert [900, 50] in low.tolist() and [1200, 900] in low.tolist()
+    assert "C sees z, frame 800" in figure.get_label()
+
+
+def test_every_network_has_its_line_and_untrained_ones_come_last():
+    one = {"mean": 0.5, "interval": [0.4, 0.6], "values": [0.4, 0.5, 0.6]}
+    found = {features: dict.fromkeys(MOTION, one) for features in FEATURES}
+    names = ["frame, untrained", *VARIANTS]
+    study3 = {"networks": 12} | {f"agent: {name}": found for name in names}
+    figure = plot_representation(study3 | {"random_driver: frame": found})
+    names = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert names == [*VARIANTS, "frame, untrained"]
+    marks = [line for line in figure.axes[2].lines if line.get_marker() == "|"]
+    assert len(marks) == 2 * 5 and all(np.size(line.get_xdata()) == 3 for line in marks)
+    assert "12 V networks" in figure.get_label() and "yaw rate of input 0.50" in figure.get_label()
