@@ -58,7 +58,7 @@ stad.start(async () => {
     if (!cleared) return;
     const { context, width } = cleared;
     const track = tracks[which];
-    const { place, scale } = projection(track, width);
+    const { place } = projection(track, width);
     const key = [which, canvas.width, stad.color("--color-background-primary")].join();
     if (background?.key !== key) background = { key, picture: paintBackground(canvas, width) };
     context.drawImage(background.picture, 0, 0, width, width);
@@ -67,7 +67,6 @@ stad.start(async () => {
     stad.strokeLine(context, points.slice(0, Math.ceil(moment) + 1), stad.COLORS.orange, 2.5);
     stad.strokeLine(context, points, "rgba(230, 159, 0, 0.55)", 1.5);
     stad.fillDot(context, points[Math.min(points.length - 1, Math.floor(moment))], 5, "#c00000");
-    return scale;
   }
 
   function paintBackground(canvas, width) {
@@ -177,7 +176,7 @@ stad.start(async () => {
     const shown = generation ? run.mean[generation - 1] : null;
     stad.describe(
       stad.get("learning"),
-      `Fitness over ${count} generations. The mean rises from ${run.mean[0].toFixed(0)} to ${run.mean.at(-1).toFixed(0)}.` +
+      `Return over ${count} generations. The average candidate's rises from ${run.mean[0].toFixed(0)} to ${run.mean.at(-1).toFixed(0)}.` +
         (shown === null ? "" : ` In generation ${generation}: ${shown.toFixed(0)}.`),
     );
     drawTrack();
@@ -199,7 +198,7 @@ stad.start(async () => {
   const setDream = (on) => {
     if (on) clock.play();
     else clock.pause();
-    stad.get("dream-play").textContent = on ? "Pause the dream" : "Let the dream run";
+    stad.get("dream-play").textContent = on ? "Pause" : "Drive";
   };
 
   slider.max = last;
