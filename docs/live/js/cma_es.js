@@ -45,8 +45,9 @@ globalThis.stad ??= {};
    * the mean; the others have negative weights, with which the covariance shrinks along what failed.
    */
   function parameters(population) {
-    const raw = Array.from({ length: population }, (_, i) =>
-      Math.log((population + 1) / 2) - Math.log(i + 1),
+    const raw = Array.from(
+      { length: population },
+      (_, i) => Math.log((population + 1) / 2) - Math.log(i + 1),
     );
     const positive = sum(raw.filter((w) => w > 0));
     const negative = -sum(raw.filter((w) => w < 0));
@@ -143,7 +144,15 @@ globalThis.stad ??= {};
       const product = (j, k) =>
         c1 * this.pathC[j] * this.pathC[k] + sum(steps.map((s, i) => rates[i] * s[j] * s[k]));
       this.covariance = this.covariance.map(
-        (value, i) => kept * value + product(...[[0, 0], [0, 1], [1, 1]][i]),
+        (value, i) =>
+          kept * value +
+          product(
+            ...[
+              [0, 0],
+              [0, 1],
+              [1, 1],
+            ][i],
+          ),
       );
 
       // 4. A path longer than a random walk's asks for longer steps, a shorter one for shorter.
@@ -185,7 +194,12 @@ globalThis.stad ??= {};
     himmelblau: {
       name: "Himmelblau (four minima)",
       f: (x, y) => (x * x + y - 11) ** 2 + (x + y * y - 7) ** 2,
-      minima: [[3, 2], [-2.805118, 3.131312], [-3.77931, -3.283186], [3.584428, -1.848126]],
+      minima: [
+        [3, 2],
+        [-2.805118, 3.131312],
+        [-3.77931, -3.283186],
+        [3.584428, -1.848126],
+      ],
       reach: 5,
     },
   };

@@ -108,7 +108,12 @@ stad.start(async () => {
       const [, size] = tensors[name].shape;
       return tensors[name].data.slice(start * size, (start + 1) * size);
     };
-    dream = new stad.Dream(mdnRnn, row("start.z"), { h: row("start.h"), c: row("start.c") }, random);
+    dream = new stad.Dream(
+      mdnRnn,
+      row("start.z"),
+      { h: row("start.h"), c: row("start.c") },
+      random,
+    );
     drawDream();
   }
 

@@ -66,7 +66,15 @@ stad.start(async () => {
     for (let value = 0; value <= top; value += 2) {
       const y = bottom - ((bottom - 20) * value) / top;
       context.fillText(String(value), 8, y + 4);
-      stad.strokeLine(context, [[left, y], [width, y]], faint, 1);
+      stad.strokeLine(
+        context,
+        [
+          [left, y],
+          [width, y],
+        ],
+        faint,
+        1,
+      );
     }
     kl.forEach((value, i) => {
       const tall = Math.max(2, ((bottom - 20) * value) / top); // a collapsed latent stays visible

@@ -5,7 +5,8 @@
   const plane = stad.get("plane");
   const choices = ["landscape", "population", "sigma"].map(stad.get);
   const [landscapeBox, populationBox, sigmaBox] = choices;
-  for (const [id, { name }] of Object.entries(stad.landscapes)) landscapeBox.append(new Option(name, id));
+  for (const [id, { name }] of Object.entries(stad.landscapes))
+    landscapeBox.append(new Option(name, id));
   landscapeBox.value = "rosenbrock";
 
   const random = new stad.Random(Date.now());
@@ -44,8 +45,8 @@
     show();
   }
 
-  /** Far enough: the points agree in all digits that fitness can show. */
-  const finished = () => strategy.sigma < 1e-8 || strategy.generation >= 300;
+  /** Whether the points hardly differ any more. */
+  const finished = () => strategy.ellipse().long < 1e-7 || strategy.generation >= 300;
 
   function show() {
     drawPlane();
@@ -74,7 +75,7 @@
 
   /** Paint the landscape, dark where it is low, on a scale of ranks: as CMA-ES sees it. */
   function paintRelief() {
-    const size = 200;
+    const size = 128; // pixels
     const values = new Float64Array(size * size);
     for (let row = 0; row < size; row++)
       for (let column = 0; column < size; column++) {
@@ -95,8 +96,10 @@
       let level = 0;
       while (level < bounds.length && value >= bounds[level]) level += 1;
       const share = level / (levels - 1);
-      const color = [38 + 190 * share, 52 + 175 * share, 92 + 125 * share];
-      image.data.set([...color, 255], 4 * p);
+      image.data[4 * p] = 38 + 190 * share;
+      image.data[4 * p + 1] = 52 + 175 * share;
+      image.data[4 * p + 2] = 92 + 125 * share;
+      image.data[4 * p + 3] = 255;
     });
     context.putImageData(image, 0, 0);
     return canvas;
@@ -108,8 +111,17 @@
     const { context, width } = cleared;
     if (relief?.landscape !== landscape) relief = { landscape, canvas: paintRelief() };
     context.drawImage(relief.canvas, 0, 0, width, width);
-    for (const minimum of landscape.minima) drawCross(context, toPixels(minimum, width), 5, "white");
-    drawCross(context, toPixels(start.map((share) => share * landscape.reach), width), 8, "#222");
+    for (const minimum of landscape.minima)
+      drawCross(context, toPixels(minimum, width), 5, "white");
+    drawCross(
+      context,
+      toPixels(
+        start.map((share) => share * landscape.reach),
+        width,
+      ),
+      8,
+      "#222",
+    );
     stad.strokeLine(
       context,
       history.map(({ mean }) => toPixels(mean, width)),
@@ -135,8 +147,24 @@
   }
 
   function drawCross(context, [x, y], size, color) {
-    stad.strokeLine(context, [[x - size, y - size], [x + size, y + size]], color, 2);
-    stad.strokeLine(context, [[x - size, y + size], [x + size, y - size]], color, 2);
+    stad.strokeLine(
+      context,
+      [
+        [x - size, y - size],
+        [x + size, y + size],
+      ],
+      color,
+      2,
+    );
+    stad.strokeLine(
+      context,
+      [
+        [x - size, y + size],
+        [x + size, y - size],
+      ],
+      color,
+      2,
+    );
   }
 
   /** Best fitness and sigma over the generations, on a logarithmic scale. */
@@ -158,15 +186,34 @@
     const faint = stad.color("--color-background-border");
     for (let power = low + 2; power <= high; power += 4) {
       const [, y] = place(0, 10 ** power);
-      stad.strokeLine(context, [[left, y], [right, y]], faint, 1);
+      stad.strokeLine(
+        context,
+        [
+          [left, y],
+          [right, y],
+        ],
+        faint,
+        1,
+      );
       context.fillText(`1e${power}`, 4, y + 4);
     }
     context.fillText(`${longest} generations`, right - 90, height - 6);
     const line = (value) => history.map((entry, i) => place(i, Math.max(value(entry), 1e-10)));
-    stad.strokeLine(context, line((entry) => entry.best), stad.COLORS.blue);
-    stad.strokeLine(context, line((entry) => entry.sigma), stad.COLORS.orange);
+    stad.strokeLine(
+      context,
+      line((entry) => entry.best),
+      stad.COLORS.blue,
+    );
+    stad.strokeLine(
+      context,
+      line((entry) => entry.sigma),
+      stad.COLORS.orange,
+    );
     const { best, sigma } = history.at(-1);
-    stad.describe(canvas, `Best fitness ${short3(best)} and step size ${short3(sigma)}, on a logarithmic scale.`);
+    stad.describe(
+      canvas,
+      `Best fitness ${short3(best)} and step size ${short3(sigma)}, on a logarithmic scale.`,
+    );
   }
 
   let timer = 0;

@@ -6,6 +6,8 @@ stad.start(async () => {
   const { places, speeds: moving, strides } = await stad.load("speeds");
   const sheet = await stad.readPicture(await stad.load("speeds_picture"));
   const speeds = [0, ...moving];
+  const columns = 1 + moving.length * strides.length; // of the picture; a row for each place
+  const film = new stad.Drive(sheet, { frames: places * columns, columns }, new Float32Array(0));
   const names = ["It is parked", `It drives at ${moving[0]}`, `It races at ${moving[1]}`];
   const score = { frame: { right: 0, all: 0 }, difference: { right: 0, all: 0 } };
   const round = { place: 4, truth: 0, bet: null, sight: "frame" };
@@ -14,11 +16,7 @@ stad.start(async () => {
   /** A frame of a place: the present one, or that of a speed some frames ago. */
   function frameOf(place, speed = 0) {
     const column = speed === 0 ? 0 : 1 + (speed - 1) * strides.length + stride;
-    const size = stad.FRAME_SIZE;
-    const { data } = sheet.getImageData(column * size, place * size, size, size);
-    return Float32Array.from({ length: 3 * size * size }, (_, i) => {
-      return data[4 * Math.floor(i / 3) + (i % 3)] / 255;
-    });
+    return film.frame(place * columns + column);
   }
 
   const differenceOf = (speed) =>
@@ -33,10 +31,11 @@ stad.start(async () => {
     stad.get("bets").append(button);
     return button;
   });
-  const columns = speeds.map((speed) => {
+  const figures = speeds.map((speed) => {
     const column = document.createElement("div");
     const title = speed ? `speed ${speed}` : "parked";
-    column.innerHTML = `<h3>${title}</h3>` + ["frame", "earlier", "difference"].map(picture).join("");
+    column.innerHTML =
+      `<h3>${title}</h3>` + ["frame", "earlier", "difference"].map(picture).join("");
     stad.get("three").append(column);
     return Object.fromEntries(
       ["frame", "earlier", "difference"].map((kind) => [kind, column.querySelector(`.${kind}`)]),
@@ -88,7 +87,8 @@ stad.start(async () => {
     stad.get("next-car").hidden = !done;
     stad.get("answer").textContent = done ? verdict() : "";
     for (const sight of ["frame", "difference"])
-      for (const part of ["right", "all"]) stad.get(`${part}-${sight}`).textContent = score[sight][part];
+      for (const part of ["right", "all"])
+        stad.get(`${part}-${sight}`).textContent = score[sight][part];
     showAll();
   }
 
@@ -105,16 +105,16 @@ stad.start(async () => {
       const difference = differenceOf(number);
       const car = speed ? `a car at speed ${speed}` : "a parked car";
       const change = meanChange(difference).toFixed(3);
-      fill(columns[number].frame, stad.paintFrame, frameOf(round.place), "now", `Frame of ${car}.`);
+      fill(figures[number].frame, stad.paintFrame, frameOf(round.place), "now", `Frame of ${car}.`);
       fill(
-        columns[number].earlier,
+        figures[number].earlier,
         stad.paintFrame,
         frameOf(round.place, number),
         `${strides[stride]} frames ago`,
         `Frame of ${car}, ${strides[stride]} frames ago.`,
       );
       fill(
-        columns[number].difference,
+        figures[number].difference,
         stad.paintDifference,
         difference,
         `difference, mean ${change}`,
