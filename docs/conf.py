@@ -17,7 +17,8 @@ from stad_lab.config import PRESET_VARIABLE
 
 HERE = Path(__file__).parent
 PACKAGE = HERE.parent / "stad_lab"
-sys.path.insert(0, str(HERE))
+sys.path[:0] = [str(HERE), str(HERE / "live")]
+from live_build import write_scripts  # noqa: E402
 from site_check import faults  # noqa: E402
 
 
@@ -100,6 +101,18 @@ def explain_widgets(app, doctree) -> None:
             )
 
 
+def style_live_page(app, page, template, context, doctree) -> None:
+    """Give the live pages their own style sheet."""
+    if page.startswith("docs/live/"):
+        app.add_css_file("../docs/live/live.css", priority=900)
+
+
+def write_live_scripts(app, error) -> None:
+    """Write the scripts of the live pages: their code, weights and data."""
+    if error is None and app.builder.name == "html":
+        write_scripts(Path(app.outdir) / "docs" / "live")
+
+
 def check_site(app, error) -> None:
     """Report each fault of the built site as a warning, which `-W` makes an error."""
     if error is None and app.builder.name == "html":
@@ -110,4 +123,6 @@ def check_site(app, error) -> None:
 def setup(app) -> None:
     """Connect both; the check runs last, after MathJax has been copied."""
     app.connect("doctree-read", explain_widgets)
+    app.connect("html-page-context", style_live_page)
+    app.connect("build-finished", write_live_scripts)
     app.connect("build-finished", check_site, priority=900)

@@ -1,0 +1,98 @@
+"use strict";
+// A small line chart on a canvas, in the colours of the theme.
+globalThis.stad ??= {};
+
+stad.COLORS = { blue: "#0072B2", orange: "#E69F00", green: "#009E73", red: "#D55E00" };
+
+stad.Chart = class {
+  /**
+   * @param {HTMLCanvasElement} canvas its size on the page is given by the style sheet
+   * @param {{xMax: number, yMax: number, xLabel: string, yLabel: string}} axes both begin at 0
+   */
+  constructor(canvas, axes) {
+    [this.canvas, this.axes] = [canvas, axes];
+    this.content = { lines: [], levels: [], marks: [] };
+    new ResizeObserver(() => this.draw()).observe(canvas);
+    stad.onTheme(() => this.draw());
+  }
+
+  /**
+   * Show other content.
+   * @param {{lines?: {points: [number, number][], color: string, dash?: number[]}[],
+   *          levels?: {y: number, text: string}[], marks?: {x: number, text: string}[]}} content
+   */
+  show(content) {
+    this.content = { lines: [], levels: [], marks: [], ...content };
+    this.draw();
+  }
+
+  draw() {
+    const { canvas, axes } = this;
+    const ratio = devicePixelRatio || 1;
+    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+    if (!width || !height) return; // folded away
+    if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
+    if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
+    const context = canvas.getContext("2d");
+    context.setTransform(ratio, 0, 0, ratio, 0, 0);
+    context.clearRect(0, 0, width, height);
+    context.font = "12px system-ui, sans-serif";
+    const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(stad.color);
+    const [left, right, top, bottom] = [36, width - 10, 22, height - 34];
+    this.x = (value) => left + ((right - left) * value) / axes.xMax;
+    this.y = (value) => bottom - ((bottom - top) * Math.min(value, axes.yMax)) / axes.yMax;
+
+    const text = (words, x, y, align) => {
+      context.textAlign = align;
+      context.fillText(words, x, y);
+    };
+    context.fillStyle = ink;
+    context.strokeStyle = faint;
+    context.lineWidth = 1;
+    for (const value of ticks(axes.yMax, 3)) {
+      stroke([[left, this.y(value)], [right, this.y(value)]]);
+      text(String(value), left - 6, this.y(value) + 4, "right");
+    }
+    const wanted = Math.max(2, Math.floor(width / 90));
+    for (const value of ticks(axes.xMax, wanted))
+      text(String(value), this.x(value), bottom + 15, "center");
+    text(axes.yLabel, 4, 12, "left");
+    text(axes.xLabel, right, height - 4, "right");
+
+    for (const { y, text: words } of this.content.levels) {
+      context.strokeStyle = ink;
+      context.setLineDash([2, 3]);
+      stroke([[left, this.y(y)], [right, this.y(y)]]);
+      text(words, right, this.y(y) - 4, "right");
+    }
+    for (const { points, color, dash = [] } of this.content.lines) {
+      context.strokeStyle = color;
+      context.lineWidth = 2;
+      context.setLineDash(dash);
+      stroke(points.map(([x, y]) => [this.x(x), this.y(y)]));
+    }
+    context.setLineDash([]);
+    for (const { x, text: words } of this.content.marks) {
+      context.strokeStyle = stad.COLORS.red;
+      stroke([[this.x(x), top], [this.x(x), bottom]]);
+      const early = this.x(x) < (left + right) / 2;
+      text(words, this.x(x) + (early ? 5 : -5), top + 10, early ? "left" : "right");
+    }
+
+    function stroke(points) {
+      context.beginPath();
+      for (const [x, y] of points) context.lineTo(x, y);
+      context.stroke();
+    }
+
+    /** About so many round numbers from 0 to a largest one. */
+    function ticks(largest, count) {
+      const rough = largest / count;
+      const power = 10 ** Math.floor(Math.log10(rough));
+      const step = [1, 2, 5, 10].map((digit) => digit * power).find((size) => size >= rough);
+      const found = [];
+      for (let n = 0; n * step <= largest * 1.0001; n++) found.push(Number((n * step).toFixed(6)));
+      return found;
+    }
+  }
+};

@@ -1,0 +1,129 @@
+"use strict";
+// What the live pages share: start, messages, text alternatives, the clock and the theme.
+globalThis.stad ??= {};
+
+/** The element with an id. */
+stad.get = (id) => document.getElementById(id);
+
+{
+  const SECOND = 1000; // milliseconds between two texts, so that a screen reader keeps up
+
+  /**
+   * Start a page: run `main`, then uncover the controls. An error becomes a sentence on the page.
+   * The page has elements `live` (all of it), `message` and `news`.
+   * @param {() => Promise<void>} main
+   */
+  stad.start = async (main) => {
+    try {
+      await main();
+      stad.get("message").hidden = true;
+      stad.get("live").dataset.state = "ready";
+    } catch (error) {
+      stad.fail(error);
+    }
+  };
+
+  /** Show an error as a sentence. */
+  stad.fail = (error) => {
+    stad.get("message").hidden = false;
+    stad.get("message").textContent = `This part of the page does not work. ${error.message}`;
+    stad.get("live").dataset.state = "failed";
+    console.error(error);
+  };
+
+  /** A function that calls `act` at most once a second, in the end with the newest argument. */
+  stad.atMostOnceASecond = (act) => {
+    let [last, timer] = [-Infinity, 0];
+    return (argument) => {
+      clearTimeout(timer);
+      const run = () => {
+        last = performance.now();
+        act(argument);
+      };
+      const wait = last + SECOND - performance.now();
+      if (wait <= 0) run();
+      else timer = setTimeout(run, wait);
+    };
+  };
+
+  /** Tell a screen reader what happened, in the polite live region `news`. */
+  stad.announce = stad.atMostOnceASecond((text) => {
+    stad.get("news").textContent = text;
+  });
+
+  const describers = new WeakMap();
+
+  /** Set the text alternative of a canvas, at most once a second. */
+  stad.describe = (canvas, text) => {
+    if (!describers.has(canvas))
+      describers.set(
+        canvas,
+        stad.atMostOnceASecond((newest) => canvas.setAttribute("aria-label", newest)),
+      );
+    describers.get(canvas)(text);
+  };
+}
+
+/** Whether the reader has asked the system for less motion: then nothing moves by itself. */
+stad.prefersStill = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
+
+/** A colour of the present theme, for example "--color-foreground-primary". */
+stad.color = (name) => getComputedStyle(document.body).getPropertyValue(name).trim();
+
+/** Call `act` whenever the reader or the system changes between light and dark. */
+stad.onTheme = (act) => {
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", act);
+  new MutationObserver(act).observe(document.body, { attributeFilter: ["data-theme"] });
+};
+
+/** Steps at a fixed rate, and a picture whenever the screen takes one. */
+stad.Clock = class {
+  /**
+   * @param {() => void} step
+   * @param {() => void} draw
+   * @param {number} rate steps a second; a slow device makes fewer, and never lags behind
+   */
+  constructor(step, draw, rate = 50) {
+    [this.step, this.draw, this.interval] = [step, draw, 1000 / rate];
+    this.running = false;
+  }
+
+  play() {
+    if (this.running) return;
+    this.running = true;
+    this.due = performance.now();
+    requestAnimationFrame((now) => this.tick(now));
+  }
+
+  pause() {
+    this.running = false;
+  }
+
+  tick(now) {
+    if (!this.running) return;
+    const longest = 3; // steps between two pictures: more would look like a jump
+    this.due = Math.max(this.due, now - longest * this.interval);
+    let stepped = false;
+    const end = performance.now() + 20; // milliseconds, which leave time for input
+    while (this.running && this.due <= now && performance.now() < end) {
+      this.due += this.interval;
+      this.step();
+      stepped = true;
+    }
+    if (stepped) this.draw();
+    requestAnimationFrame((next) => this.tick(next));
+  }
+};
+
+/**
+ * Do small pieces of work one after another while the page stays responsive.
+ * @param {() => boolean} work one piece; returns false when all is done
+ * @param {number} slice milliseconds of work between two pauses
+ */
+stad.inBackground = async (work, slice = 8) => {
+  for (let going = true; going; ) {
+    const end = performance.now() + slice;
+    while (going && performance.now() < end) going = work();
+    await stad.pause();
+  }
+};
