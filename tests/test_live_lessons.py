@@ -1,4 +1,4 @@
-"""The live pages on speeds, on the KL weight and on evolution, in a headless Chromium from the disk."""
+"""The live pages on speeds, the KL weight and evolution: opened from the disk in a Chromium."""
 
 import json
 import re
@@ -61,29 +61,45 @@ def browser():
         browser.close()
 
 
-@pytest.fixture
-def opened(browser, pages):
-    """A function that opens a page and waits until it is ready; no page may have an error."""
-    errors, contexts = [], []
-
-    def open_page(name, **context):
-        contexts.append(browser.new_context(**context))
-        page = contexts[-1].new_page()
+@pytest.fixture(scope="module")
+def tabs(browser, pages):
+    """A page in a tab of a phone's size by its name, and all errors and requests of the network."""
+    errors, tabs = [], {}
+    for name in NAMES:
+        page = tabs[name] = browser.new_page(viewport={"width": 360, "height": 740})
         page.set_default_timeout(SLOW)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
         page.goto((pages / f"{name}.html").as_uri())
-        page.wait_for_selector("#live[data-state=ready]")
-        return page
+    return tabs, errors
 
-    yield open_page
-    for context in contexts:
-        context.close()
+
+@pytest.fixture
+def opened(tabs):
+    """A function that returns a page when it is ready; no page may have an error."""
+    tabs, errors = tabs
+
+    def ready(name):
+        tabs[name].bring_to_front()  # a hidden page draws nothing
+        tabs[name].wait_for_selector("#live[data-state=ready]")
+        return tabs[name]
+
+    yield ready
     assert not errors
 
 
-def number(page, selector):
-    return float(re.search(r"-?[\d.]+", page.inner_text(selector))[0])
+def pycma(start, sigma, normals):
+    """pycma's strategy on a stream of standard normal numbers (generations, population, 2)."""
+    stream = iter(normals)
+
+    def randn(*_):
+        # The square root of C is symmetric in ours; pycma's is not, so its numbers are turned.
+        return next(stream) @ strategy.sm.B
+
+    options = {"popsize": normals.shape[1], "randn": randn, "seed": np.nan}
+    strategy = cma.CMAEvolutionStrategy(start, sigma, options | {"verbose": -9, "verb_log": 0})
+    strategy.sm.C[:], strategy.sm.D[:] = np.eye(2), 1  # pycma begins not quite round
+    return strategy
 
 
 def test_cma_es_agrees_with_pycma_on_the_same_random_numbers(opened):
@@ -104,12 +120,7 @@ def test_cma_es_agrees_with_pycma_on_the_same_random_numbers(opened):
             }""",
             [normals.tolist(), start, sigma, name],
         )
-        stream = iter(normals)
-        # The square root of C is symmetric in ours; pycma's is not, so its numbers are turned.
-        randn = lambda *_, stream=stream: next(stream) @ strategy.sm.B  # noqa: E731
-        options = {"popsize": population, "randn": randn, "seed": np.nan}
-        strategy = cma.CMAEvolutionStrategy(start, sigma, options | {"verbose": -9, "verb_log": 0})
-        strategy.sm.C[:], strategy.sm.D[:] = np.eye(2), 1  # pycma begins not quite round
+        strategy = pycma(start, sigma, normals)
         for ours in found:
             points = strategy.ask()
             np.testing.assert_allclose(ours["points"], points, rtol=1e-9, atol=1e-9)
@@ -130,7 +141,7 @@ def test_the_recorded_controllers_are_those_of_the_shipped_run():
 
 
 def test_the_dream_of_a_generation_begins_as_in_python(opened):
-    page, agent = opened("evolution", reduced_motion="reduce"), load_agent("cropped_input")
+    page, agent = opened("evolution"), load_agent("cropped_input")
     tensors = live_build.load_file(LIVE / "data" / "evolution_tensors.safetensors")
     chosen = secrets.randbelow(len(tensors["controllers"]))
     found = page.evaluate(
@@ -191,8 +202,7 @@ def test_cma_es_on_the_page_can_be_begun_stepped_by_keyboard(opened):
 
 
 def test_a_bet_counts_once_and_shows_the_answer(opened):
-    page = opened("speeds", viewport={"width": 360, "height": 640})
-    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    page = opened("speeds")
     page.locator("#bets button").first.evaluate("(button) => [button.click(), button.click()]")
     assert page.inner_text("#all-frame") == "1"
     answered = page.inner_text("#answer")
@@ -236,11 +246,13 @@ def test_pictures_and_numbers_follow_the_kl_weight(opened):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_impatient_clicks_break_nothing(opened, name):
+def test_a_page_fits_a_phone_and_bears_impatient_clicks(opened, name):
     page, rng = opened(name), np.random.default_rng(secrets.randbits(64))
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
     page.evaluate(
         """(order) => {
-            const controls = [...document.querySelectorAll("#live button, #live input, #live canvas")];
+            const kinds = "#live button, #live input, #live canvas";
+            const controls = [...document.querySelectorAll(kinds)];
             for (const share of order) {
                 const control = controls[Math.floor(share * controls.length)];
                 if (control.type === "range") {
@@ -251,5 +263,7 @@ def test_impatient_clicks_break_nothing(opened, name):
         }""",
         rng.random(200).tolist(),
     )
-    page.wait_for_function("document.querySelector('#live').dataset.state === 'ready'")
-    page.wait_for_timeout(50)
+    assert (
+        page.evaluate("new Promise(requestAnimationFrame).then(() => live.dataset.state)")
+        == "ready"
+    )

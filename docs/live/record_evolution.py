@@ -4,7 +4,8 @@
 
 The run is that of the shipped agent `cropped_input` (notebook 04). Its log is told to CMA-ES again,
 which gives the mean controller of every generation without driving. Some of these controllers then
-drive two tracks that no training and no evaluation uses. Takes three minutes; writes docs/live/data:
+drive two tracks that no training and no evaluation uses. It takes three
+minutes and writes into docs/live/data:
 
     evolution_tensors.safetensors    controllers, roads, paths, and the memories of M to dream from
     evolution.json                   the learning curve, and the return of each path

@@ -1,9 +1,9 @@
-"""Record the data of the live page *The price of a nat*: V with six KL weights.
+"""Record the data of the live page *The price of a nat*: V with eight KL weights.
 
     python docs/live/record_nat.py --work runs/nat
 
-Trains V with each KL weight of KL_WEIGHTS on a small dataset of the random driver (about a quarter
-of an hour), measures rate and distortion on episodes that no V has seen, and writes docs/live/data:
+Trains V with each KL weight of KL_WEIGHTS on a small dataset of the random driver (about twenty
+minutes), measures rate and distortion on episodes that no V has seen, and writes docs/live/data:
 
     nat.json    the measurements, one entry for each KL weight
     nat.webp    for each shown frame a row of pictures, the frame and then its reconstructions, and
@@ -23,11 +23,12 @@ from stad_lab.config import Config
 from stad_lab.envs.frames import difference_image, earlier_frames
 from stad_lab.evaluation.metrics import reconstruct, vae_metrics
 from stad_lab.io.weights import VAE_FILE, load_vae
-from stad_lab.replication.latents import KL_WEIGHTS, random_trajectories
+from stad_lab.replication.latents import random_trajectories
 from stad_lab.training.pipeline import train
 from stad_lab.viz.plots import difference_colors
 
 DATA = Path(__file__).parent / "data"
+KL_WEIGHTS = (0.02, 0.08, 0.25, 1.0, 2.0, 4.0, 8.0, 16.0)
 CONFIG = Config.preset(
     "laptop",
     variant="input_output",
@@ -58,7 +59,9 @@ def measure(work: Path) -> tuple[list[dict], np.ndarray]:
     for weight in KL_WEIGHTS:
         vae, _ = load_vae(work / f"kl_{weight:g}" / VAE_FILE)
         measured = vae_metrics(vae, *every)
-        kept = {name: round(measured[name], 2) for name in ("frame_error", "difference_error", "kl")}
+        kept = {
+            name: round(measured[name], 2) for name in ("frame_error", "difference_error", "kl")
+        }
         kl = [round(value, 3) for value in measured["kl_of_latents"]]
         found.append({"kl_weight": weight, **kept, "kl_of_latents": kl})
         decoded = reconstruct(vae, *shown)
