@@ -149,6 +149,6 @@ stad.start(async () => {
     timer = setInterval(() => (chosen === last ? stop() : choose(chosen + 1)), 1200);
   });
   new ResizeObserver(drawBars).observe(stad.get("bars"));
-  stad.onTheme(show);
+  stad.onTheme(drawBars);
   show();
 });

@@ -113,21 +113,10 @@
     context.drawImage(relief.canvas, 0, 0, width, width);
     for (const minimum of landscape.minima)
       drawCross(context, toPixels(minimum, width), 5, "white");
-    drawCross(
-      context,
-      toPixels(
-        start.map((share) => share * landscape.reach),
-        width,
-      ),
-      8,
-      "#222",
-    );
-    stad.strokeLine(
-      context,
-      history.map(({ mean }) => toPixels(mean, width)),
-      stad.COLORS.orange,
-      2,
-    );
+    const begin = history[0].mean;
+    drawCross(context, toPixels(begin, width), 8, "#222");
+    const path = history.map(({ mean }) => toPixels(mean, width));
+    stad.strokeLine(context, path, stad.COLORS.orange, 2);
     const order = sample.map((_, i) => i).sort((a, b) => fitness[a] - fitness[b]);
     const better = strategy.constants.better;
     order.forEach((i, rank) => {
@@ -147,24 +136,13 @@
   }
 
   function drawCross(context, [x, y], size, color) {
-    stad.strokeLine(
-      context,
-      [
-        [x - size, y - size],
-        [x + size, y + size],
-      ],
-      color,
-      2,
-    );
-    stad.strokeLine(
-      context,
-      [
-        [x - size, y + size],
-        [x + size, y - size],
-      ],
-      color,
-      2,
-    );
+    for (const down of [size, -size]) {
+      const [from, to] = [
+        [x - size, y - down],
+        [x + size, y + down],
+      ];
+      stad.strokeLine(context, [from, to], color, 2);
+    }
   }
 
   /** Best fitness and sigma over the generations, on a logarithmic scale. */
@@ -186,15 +164,8 @@
     const faint = stad.color("--color-background-border");
     for (let power = low + 2; power <= high; power += 4) {
       const [, y] = place(0, 10 ** power);
-      stad.strokeLine(
-        context,
-        [
-          [left, y],
-          [right, y],
-        ],
-        faint,
-        1,
-      );
+      const [from, to] = [left, right].map((x) => [x, y]);
+      stad.strokeLine(context, [from, to], faint, 1);
       context.fillText(`1e${power}`, 4, y + 4);
     }
     context.fillText(`${longest} generations`, right - 90, height - 6);
@@ -236,6 +207,12 @@
     restart();
   }
 
+  function stepAloud() {
+    stop();
+    step();
+    stad.announce(stad.get("state").textContent);
+  }
+
   plane.addEventListener("click", (event) => {
     const { left, top, width, height } = plane.getBoundingClientRect();
     begin((2 * (event.clientX - left)) / width - 1, 1 - (2 * (event.clientY - top)) / height);
@@ -244,7 +221,7 @@
     const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     const move = moves[event.key];
     if (move) begin(start[0] + 0.05 * move[0], start[1] + 0.05 * move[1]);
-    else if (event.key === "Enter" || event.key === " ") step();
+    else if (event.key === "Enter" || event.key === " ") stepAloud();
     else return;
     event.preventDefault(); // arrow keys and the space bar would move the page
   });
@@ -254,11 +231,7 @@
       stop();
       restart();
     });
-  stad.get("step").addEventListener("click", () => {
-    stop();
-    step();
-    stad.announce(stad.get("state").textContent);
-  });
+  stad.get("step").addEventListener("click", stepAloud);
   stad.get("run").addEventListener("click", run);
   stad.get("restart").addEventListener("click", () => {
     stop();

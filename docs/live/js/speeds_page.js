@@ -141,9 +141,7 @@ stad.start(async () => {
   for (const radio of document.querySelectorAll("[name=sight]"))
     radio.addEventListener("change", () => {
       round.sight = radio.value;
-      if (round.bet === null) show();
-      else nextRound();
+      nextRound(); // another car: the difference image of this one may have been seen
     });
-  stad.onTheme(show);
   nextRound();
 });
