@@ -1,0 +1,245 @@
+"use strict";
+// The page "Drive the dream".
+
+stad.start(async () => {
+  const AGENT = "input_output"; // its V decodes a difference image, too
+  const [BEGIN, SHOW_OFF, LONGEST] = [50, 150, 1000]; // frames: CarRacing zooms in until 50
+  const LASTING = 10; // frames that dream and drive must be apart before we call them parted
+  const COLORS = stad.COLORS;
+  const get = stad.get;
+
+  const drive = await stad.Drive.load();
+  let [t, dream, from, seed] = [BEGIN, null, 0, 1];
+  let driver = "agent";
+  let shown = null; // what V has decoded of the dream or of the drive
+  let untouched = !stad.prefersStill(); // the first dream begins by itself
+  let request = 0; // number of the last wish to close the eyes: a newer one replaces it
+  let [distances, spreads, parted] = [[], [], null];
+  let [vae, mdnRnn, controller, memory] = [null, null, null, null];
+
+  const hand = new stad.Hand();
+  const clock = new stad.Clock(step, draw);
+  const distanceChart = new stad.Chart(get("distance"), {
+    xMax: 200, yMax: 0.3, xLabel: "frames of the dream", yLabel: "RMS difference",
+  }); // prettier-ignore
+  const spreadChart = new stad.Chart(get("spread"), {
+    xMax: 200, yMax: 1.2, xLabel: "frames of the dream", yLabel: "standard deviation",
+  }); // prettier-ignore
+  const level = await typicalDistance();
+
+  function step() {
+    if (!dream) {
+      t = t < drive.length - 1 ? t + 1 : BEGIN;
+      if (untouched && t === SHOW_OFF) closeEyes();
+      return;
+    }
+    if (dream.frames >= LONGEST) return setPlaying(false);
+    const now = from + dream.frames;
+    let action = hand.action;
+    if (driver === "hand") action = hand.act();
+    else if (driver === "recorded" && now < drive.length) action = drive.action(now);
+    else action = stad.control(controller, dream.z, dream.state.h);
+    hand.action.set(action);
+    dream.step(action);
+    t = Math.min(from + dream.frames, drive.length - 1);
+    const spread = dream.prediction.standardDeviation();
+    spreads.push([dream.frames, spread.reduce((sum, one) => sum + one, 0) / spread.length]);
+  }
+
+  function draw() {
+    const frame = drive.frame(t);
+    const difference = drive.difference(t);
+    stad.paintFrame(get("real"), frame);
+    stad.paintDifference(get("real-difference"), difference);
+    const z = dream ? dream.z : memory?.latents[t];
+    shown = z ? vae.decode(z) : { frame, difference }; // V still reads: show what it will see
+    stad.paintFrame(get("dream"), shown.frame);
+    stad.paintDifference(get("dream-difference"), shown.difference);
+    if (dream) compare(frame);
+    tell();
+  }
+
+  /** Note how far the dream is from the drive, and when they have parted. */
+  function compare(frame) {
+    const count = dream.frames;
+    if (count && from + count < drive.length && distances.at(-1)?.[0] !== count) {
+      distances.push([count, stad.rmsDistance(shown.frame, frame)]);
+      const last = distances.slice(-LASTING);
+      if (parted === null && last.length === LASTING && last.every(([, one]) => one > level)) {
+        parted = last[0][0];
+        stad.announce(`Dream and drive have parted, ${parted} frames after the eyes closed.`);
+      }
+    }
+    const xMax = Math.max(200, Math.ceil(count / 100) * 100);
+    distanceChart.axes.xMax = spreadChart.axes.xMax = xMax;
+    showCharts();
+  }
+
+  function showCharts() {
+    distanceChart.show({
+      lines: [{ points: distances, color: COLORS.orange }],
+      levels: [{ y: level, text: "1 s apart" }],
+      marks: parted === null ? [] : [{ x: parted, text: `parted: ${parted}` }],
+    });
+    spreadChart.show({ lines: [{ points: spreads, color: COLORS.blue }] });
+  }
+
+  /** Captions and text alternatives. */
+  function tell() {
+    const set = (id, text) => {
+      if (get(id).textContent !== text) get(id).textContent = text;
+    };
+    const [steering, gas, brake] = dream ? hand.action : drive.action(t);
+    const wheel = { agent: "C drives", hand: "you drive", recorded: "recorded actions" }[driver];
+    const over = dream && from + dream.frames >= drive.length;
+    set("t", `${t}${over ? ", the recording has ended" : ""}`);
+    set("dream-name", dream ? "The dream" : memory?.latents[t] ? "V's reconstruction" : "Seen");
+    set("dream-note", dream ? `frame ${dream.frames}, ${wheel}` : "The eyes are open.");
+    set("eyes", dream ? "Open the eyes" : "Close the eyes here");
+    set("scrub-value", String(t));
+    set(
+      "parted",
+      parted !== null
+        ? `They parted after ${parted} frames (${(parted / 50).toFixed(1)} s).`
+        : dream
+          ? "They have not parted yet."
+          : "Close the eyes to see the curve.",
+    );
+    get("scrub").value = t;
+    get("again").disabled = !dream;
+    get("live").classList.toggle("asleep", Boolean(dream));
+    get("bar-steering").style.transform = `scaleX(${steering})`;
+    get("bar-gas").style.transform = `scaleX(${gas})`;
+    get("bar-brake").style.transform = `scaleX(${brake})`;
+    const pedals = `steering ${steering.toFixed(1)}, gas ${gas.toFixed(1)}, brake ${brake.toFixed(1)}`;
+    stad.describe(get("real"), `recorded drive, frame ${t} of ${drive.length}`);
+    const distance = distances.at(-1)?.[1].toFixed(2);
+    stad.describe(
+      get("dream"),
+      dream
+        ? `the dream, frame ${dream.frames}, ${wheel}, ${pedals}` +
+            (distance ? `, distance from the recorded drive ${distance}` : "")
+        : `V's reconstruction of frame ${t}, ${pedals}`,
+    );
+    if (!dream) return;
+    const at = `after ${dream.frames} frames`;
+    stad.describe(get("distance"), `distance from the recorded drive ${at}: ${distance ?? "none"}`);
+    stad.describe(get("spread"), `spread of M's prediction ${at}: ${spreads.at(-1)?.[1].toFixed(2)}`);
+  }
+
+  /** Begin a dream at the present frame, as soon as M remembers the drive up to it. */
+  async function closeEyes(start = t) {
+    const wish = ++request;
+    if (!memory || memory.length <= start) {
+      get("dream-note").textContent = "M is reading the drive up to this frame.";
+      clock.pause();
+      while (!memory || memory.length <= start) {
+        await new Promise((done) => setTimeout(done, 20));
+        if (wish !== request) return;
+      }
+    }
+    [t, from] = [start, start];
+    dream = new stad.Dream(
+      mdnRnn, memory.latents[from], memory.before[from], new stad.Random(seed++),
+    ); // prettier-ignore
+    dream.temperature = Number(get("temperature").value);
+    hand.action.set(drive.action(from)); // the car goes on as it was
+    [distances, spreads, parted] = [[], [], null];
+    stad.announce(`The eyes are closed at frame ${from}: the dream begins.`);
+    setPlaying(true);
+    draw();
+  }
+
+  function openEyes() {
+    request++;
+    dream = null;
+    stad.announce(`The eyes are open at frame ${t}.`);
+    if (t >= drive.length - 1) t = BEGIN;
+    draw();
+  }
+
+  function setPlaying(playing) {
+    if (playing) clock.play();
+    else clock.pause();
+    get("play").textContent = playing ? "Pause" : "Play";
+  }
+
+  function setDriver(value) {
+    driver = value;
+    document.querySelector(`input[name=driver][value=${value}]`).checked = true;
+    if (!dream) closeEyes();
+    else setPlaying(true);
+  }
+
+  /** Two frames of this drive that are a second apart differ by so much on average. */
+  async function typicalDistance() {
+    let [sum, count, i] = [0, 0, BEGIN];
+    await stad.inBackground(() => {
+      sum += stad.rmsDistance(drive.frame(i), drive.frame(i + 50));
+      count += 1;
+      i += 7;
+      return i + 50 < drive.length;
+    });
+    return sum / count;
+  }
+
+  // Controls
+  const touched = (act) => (event) => {
+    untouched = false;
+    act(event);
+  };
+  const toggleEyes = touched(() => (dream ? openEyes() : closeEyes()));
+  const togglePlay = touched(() => {
+    if (!clock.running && dream?.frames >= LONGEST) openEyes();
+    setPlaying(!clock.running);
+  });
+  get("eyes").addEventListener("click", toggleEyes);
+  get("play").addEventListener("click", togglePlay);
+  get("again").addEventListener("click", touched(() => closeEyes(from)));
+  get("driver").addEventListener("change", touched(({ target }) => {
+    setDriver(target.value);
+    if (driver === "hand" && matchMedia("(hover: hover)").matches) get("seat").focus();
+  })); // prettier-ignore
+  get("scrub").addEventListener("input", touched(({ target }) => {
+    request++;
+    [dream, t] = [null, Number(target.value)];
+    setPlaying(false);
+    draw();
+  })); // prettier-ignore
+  get("temperature").addEventListener("input", ({ target }) => {
+    get("temperature-value").textContent = Number(target.value).toFixed(2);
+    if (dream) dream.temperature = Number(target.value);
+  });
+  get("seat").addEventListener("keydown", (event) => {
+    if (event.target.matches("button") || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (event.key !== " " && event.key.toLowerCase() !== "e") return;
+    event.preventDefault();
+    if (event.repeat) return;
+    if (event.key === " ") togglePlay();
+    else toggleEyes();
+  });
+  stad.listenToPedals(hand, get("seat"), touched(() => {
+    if (driver !== "hand" || !dream) setDriver("hand");
+  })); // prettier-ignore
+  addEventListener("gamepadconnected", ({ gamepad }) => {
+    get("gamepad").textContent = `Gamepad found: ${gamepad.id}. Choose "You" to drive with it.`;
+  });
+
+  // The drive plays at once; V and M are loaded and read it meanwhile.
+  get("play").disabled = false;
+  draw();
+  showCharts();
+  setPlaying(untouched);
+  [vae, mdnRnn, controller] = await Promise.all([
+    stad.VAE.load(AGENT), stad.MDNRNN.load(AGENT), stad.loadController(AGENT),
+  ]); // prettier-ignore
+  memory = new stad.Memory(vae, mdnRnn, drive);
+  get("eyes").disabled = false;
+  stad.page = { drive, vae, mdnRnn, controller, memory, clock, get dream() { return dream; } }; // prettier-ignore
+  stad
+    .inBackground(() => {
+      memory.advance();
+      return memory.length < drive.length;
+    })
+    .then(() => clock.running || draw(), stad.fail);
+});
