@@ -11,8 +11,10 @@ import cma
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from stad_lab import load_agent
+from stad_lab.agent import Agent, load_agent, rollout
+from stad_lab.envs.cars import Cars
 from stad_lab.models.controller import control
 
 CHROMIUM = (
@@ -32,6 +34,7 @@ playwright = pytest.importorskip(
 LIVE = Path(__file__).parent.parent / "docs" / "live"
 sys.path.insert(0, str(LIVE))
 import live_build  # noqa: E402
+import record_speeds  # noqa: E402
 
 SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
 NAMES = ("speeds", "nat", "evolution")
@@ -138,6 +141,27 @@ def test_the_recorded_controllers_are_those_of_the_shipped_run():
     first, last = tensors["controllers"][shown.index(0)], tensors["controllers"][shown.index(95)]
     np.testing.assert_allclose(last, agent.parameters, atol=1e-6)
     assert np.count_nonzero(first) == 1 and first[-2] == -0.5  # the gas alone
+
+
+def test_a_recorded_path_is_what_its_controller_drives():
+    tensors = live_build.load_file(LIVE / "data" / "evolution_tensors.safetensors")
+    facts = json.loads((LIVE / "data" / "evolution.json").read_text("utf-8"))
+    cars, places = Cars(1, "frame", bar=False), []
+    cars.reset([facts["tracks"][0]["track"]])
+    agent = Agent(load_agent("cropped_input").world_model, tensors["controllers"][-1].astype(float))
+    rollout(agent, cars, 101, observe=lambda *_: places.append(cars.cars["position"][0, 0].copy()))
+    begin = sum(facts["tracks"][0]["points"][:-1])
+    recorded = tensors["paths.0"][begin : begin + 21]  # one in five frames
+    np.testing.assert_allclose(places[:: facts["every"]], recorded, atol=0.3)  # of half precision
+
+
+def test_the_frames_of_the_speeds_are_those_that_the_engine_draws():
+    cars = Cars(1, "frame", bar=False)
+    cars.reset([record_speeds.TRACK])
+    place = secrets.randbelow(record_speeds.PLACES)
+    sheet = np.asarray(Image.open(LIVE / "data" / "speeds.webp"))
+    row = sheet[64 * place : 64 * (place + 1)].astype(int)
+    assert np.abs(row - record_speeds.place_row(cars, place)).mean() < 0.1
 
 
 def test_the_dream_of_a_generation_begins_as_in_python(opened):
