@@ -1,0 +1,310 @@
+"""The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
+
+import re
+import secrets
+import shutil
+import sys
+from pathlib import Path
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
+
+import numpy as np
+import pytest
+import torch
+
+from stad_lab.agent import load_agent
+from stad_lab.config import VARIANTS
+from stad_lab.models.controller import control
+from stad_lab.models.vae import to_array, to_tensor
+from stad_lab.play.session import Hand
+
+CHROMIUM = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
+if not CHROMIUM:
+    pytest.skip(
+        "no chromium on the PATH: install it (Debian: apt-get install chromium)",
+        allow_module_level=True,
+    )
+playwright = pytest.importorskip(
+    "playwright.sync_api",
+    reason="no playwright: pip install -r environment.txt",
+    exc_type=ImportError,
+)
+
+LIVE = Path(__file__).parent.parent / "docs" / "live"
+sys.path.insert(0, str(LIVE))
+import live_build  # noqa: E402
+
+CLOSE = 1e-5
+SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
+MEGABYTES = 6  # of a page, its scripts and its data
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    """A folder with the pages as plain HTML, and all their scripts."""
+    folder = tmp_path_factory.mktemp("live")
+    live_build.write_scripts(folder)
+    for name in ("dream", "latent"):
+        text = (LIVE / f"{name}.md").read_text(encoding="utf-8")
+        body = re.search(r"```\{raw\} html\n(.*?)```", text, re.DOTALL)[1]
+        head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>live</title>'
+        style = '<link rel="stylesheet" href="live.css"><body>'
+        (folder / f"{name}.html").write_text(head + style + body, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """One Chromium for all tests."""
+    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=flags)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def opened(browser, pages):
+    """A function that opens a page and waits until it is ready; no page may have an error."""
+    errors, contexts = [], []
+
+    def open_page(name, **context):
+        contexts.append(browser.new_context(**context))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(SLOW)
+        page.loaded = set()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("request", lambda request: page.loaded.add(request.url))
+        page.goto((pages / f"{name}.html").as_uri())
+        page.wait_for_selector("#live[data-state=ready]")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not errors
+
+
+def megabytes(page):
+    """The size of all that a page has loaded; an AssertionError if it used a network."""
+    loaded = [one for one in page.loaded if not one.startswith("data:")]
+    assert all(one.startswith("file://") for one in loaded)
+    files = [Path(url2pathname(urlsplit(one).path)) for one in loaded]
+    return sum(file.stat().st_size for file in files) / 1e6
+
+
+@pytest.fixture
+def rng():
+    """Other numbers in every run."""
+    seed = secrets.randbits(64)
+    print(f"seed {seed}")
+    return np.random.default_rng(seed)
+
+
+def some_pictures(rng):
+    """A random frame of smooth shapes and a difference image: float32 (64, 64, 3)."""
+    coarse = rng.uniform(0, 1, (2, 8, 8, 3)).astype(np.float32)
+    frame, earlier = coarse.repeat(8, axis=1).repeat(8, axis=2)
+    return frame, frame - earlier
+
+
+V_IN_THE_PAGE = """async ([variant, frame, difference, z]) => {
+    const vae = await stad.VAE.load(variant)
+    const pictures = [frame, difference].map((one) => Float32Array.from(one))
+    const { mu, logvar } = vae.encode(...pictures)
+    const decoded = vae.decode(Float32Array.from(z))
+    return [mu, logvar, decoded.frame, decoded.difference].map((one) => one && Array.from(one))
+}"""
+
+
+def test_every_v_encodes_and_decodes_random_inputs_as_in_python(opened, rng):
+    page = opened("latent", reduced_motion="reduce")
+    for variant in VARIANTS:
+        vae = load_agent(variant).vae
+        frame, difference = some_pictures(rng)
+        z = rng.normal(0, 1.5, 32).astype(np.float32)
+        inputs = [variant, *(one.ravel().tolist() for one in (frame, difference, z))]
+        found = page.evaluate(V_IN_THE_PAGE, inputs)
+        pictures = (to_tensor(one[None]) for one in (frame, difference))
+        with torch.no_grad():
+            mu, logvar = vae.encode(*pictures)
+            decoded = vae.decode(torch.from_numpy(z)[None])
+        decoded = [None if one is None else to_array(one) for one in decoded]
+        for ours, theirs in zip(found, [mu.numpy(), logvar.numpy(), *decoded], strict=True):
+            assert (ours is None) == (theirs is None)
+            if ours is not None:
+                np.testing.assert_allclose(ours, theirs.ravel(), rtol=0, atol=CLOSE)
+    assert megabytes(page) < MEGABYTES
+
+
+M_IN_THE_PAGE = """async ([latents, actions, parameters]) => {
+    const [mdnRnn, shipped] = [await stad.MDNRNN.load("input_output"), parameters]
+    let state = mdnRnn.emptyState()
+    return latents.map((row, t) => {
+        const z = Float32Array.from(row)
+        const action = stad.control(shipped, z, state.h)
+        state = mdnRnn.remember(z, Float32Array.from(actions[t]), state)
+        const { logits, mean, logsigma } = mdnRnn.mixture(state.h)
+        return [state.h, state.c, logits, mean, logsigma, action].map((one) => Array.from(one))
+    })
+}"""
+DREAM_IN_THE_PAGE = """([z, uniforms, normals, temperature]) => {
+    const { mdnRnn, controller, vae } = stad.page
+    const [uniform, normal] = [uniforms, normals].map((numbers) => () => numbers.shift())
+    const dream = new stad.Dream(
+        mdnRnn, Float32Array.from(z), mdnRnn.emptyState(), { uniform, normal })
+    dream.temperature = temperature
+    const steps = []
+    while (normals.length) {
+        const action = stad.control(controller, dream.z, dream.state.h)
+        dream.step(action)
+        steps.push([...dream.z, ...action])
+    }
+    return [steps, Array.from(vae.decode(dream.z).frame)]
+}"""
+
+
+def test_m_predicts_and_c_acts_as_in_python_over_200_steps(opened, rng):
+    page, agent = opened("dream", reduced_motion="reduce"), load_agent("input_output")
+    latents = rng.normal(0, 1, (200, 32)).astype(np.float32)
+    actions = rng.uniform([-1, 0, 0], 1, (200, 3)).astype(np.float32)
+    parameters = agent.parameters + rng.normal(0, 0.1, agent.parameters.shape)
+    rows = page.evaluate(M_IN_THE_PAGE, [latents.tolist(), actions.tolist(), parameters.tolist()])
+    h, c, logits, mean, logsigma, acted = (np.array(part) for part in zip(*rows, strict=True))
+    z, done = torch.from_numpy(latents)[None], torch.from_numpy(actions)[None]
+    with torch.no_grad():
+        mixture, state = agent.mdn_rnn(z, done)
+        hidden = agent.mdn_rnn.remember(z, done)[0][0].numpy()
+    before = np.concatenate([np.zeros((1, 256), np.float32), hidden[:-1]])
+    expected = control(parameters, np.concatenate([latents, before], axis=1))
+    logpi = torch.from_numpy(logits).view(200, 32, 5).log_softmax(-1).numpy()
+    for ours, theirs in (
+        (h, hidden),
+        (c[-1], state[1][0, 0].numpy()),
+        (logpi, mixture.logpi[0].numpy()),
+        (mean.reshape(200, 32, 5), mixture.mean[0].numpy()),
+        (logsigma.reshape(200, 32, 5), mixture.logsigma[0].numpy()),
+        (acted, expected),
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=0, atol=CLOSE)
+
+
+@torch.no_grad()
+def dream_in_python(agent, z, temperature, rng, steps):
+    """A dream with C: z and action of every step, and the random numbers that chose them.
+
+    No uniform number is so close to a boundary that rounding could choose another Gaussian.
+    """
+    zeros = torch.zeros(1, 1, 256)
+    state, rows, uniforms, normals = (zeros, zeros), [], [], []
+    for _ in range(steps):
+        action = control(agent.parameters, np.concatenate([z, state[0][0, 0].numpy()])[None])[0]
+        mixture, state = agent.mdn_rnn(
+            torch.from_numpy(z)[None, None], torch.from_numpy(action)[None, None], state
+        )
+        logpi, mean, logsigma = (part[0, 0].double() for part in mixture)
+        bounds = (logpi / temperature).softmax(-1).cumsum(-1).numpy()
+        uniform = rng.uniform(size=32)
+        while (close := np.abs(bounds - uniform[:, None]).min(axis=1) < 1e-4).any():
+            uniform[close] = rng.uniform(size=close.sum())
+        chosen = (uniform[:, None] > bounds[:, :-1]).sum(axis=1)
+        normal, row = rng.standard_normal(32), np.arange(32)
+        sigma = logsigma.exp().numpy()[row, chosen] * np.sqrt(temperature)
+        z = (mean.numpy()[row, chosen] + sigma * normal).astype(np.float32)
+        rows.append([*z, *action])
+        uniforms += uniform.tolist()
+        normals += normal.tolist()
+    return np.array(rows), agent.vae.decode(torch.from_numpy(z)[None])[0], uniforms, normals
+
+
+def test_a_dream_of_200_steps_with_the_same_noise_is_that_of_python(opened, rng):
+    page, agent = opened("dream", reduced_motion="reduce"), load_agent("input_output")
+    page.wait_for_function("stad.page")
+    z, temperature = rng.standard_normal(32).astype(np.float32), float(rng.uniform(0.3, 1.2))
+    rows, frame, *noise = dream_in_python(agent, z, temperature, rng, 200)
+    steps, decoded = page.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, temperature])
+    np.testing.assert_allclose(steps, rows, rtol=0, atol=CLOSE)
+    np.testing.assert_allclose(decoded, to_array(frame).ravel(), rtol=0, atol=CLOSE)
+    assert megabytes(page) < MEGABYTES
+
+
+def test_held_keys_make_the_same_actions_as_in_the_package(opened, rng):
+    page, hand = opened("dream", reduced_motion="reduce"), Hand()
+    held = [[p for p in ("left", "right", "gas", "brake") if rng.random() < 0.4] for _ in range(60)]
+    found = page.evaluate(
+        """(all) => {
+            const hand = new stad.Hand()
+            return all.map((held) => {
+                hand.held = new Map(held.map((pedal) => [pedal, pedal]))
+                return Array.from(hand.act())
+            })
+        }""",
+        held,
+    )
+    for pedals, ours in zip(held, found, strict=True):
+        hand.hold(*pedals)
+        np.testing.assert_allclose(ours, hand.act(), rtol=0, atol=CLOSE)
+
+
+def test_the_reader_closes_the_eyes_drives_and_opens_them_with_the_keyboard_alone(opened):
+    page = opened("dream", reduced_motion="reduce", viewport={"width": 360, "height": 740})
+    page.wait_for_function("stad.page")
+    assert page.evaluate("!stad.page.clock.running && !stad.page.dream")  # nothing moves by itself
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    page.locator("#scrub").press("ArrowRight")
+    assert page.inner_text("#scrub-value") == "51"
+    page.locator("#seat").press("e")
+    page.wait_for_function("stad.page.dream?.frames > 3")
+    page.keyboard.down("ArrowLeft")
+    page.wait_for_function("stad.page.dream.frames > 20")
+    assert page.is_checked("input[value=hand]")
+    page.wait_for_function("document.querySelector('#dream').ariaLabel.includes('steering -')")
+    page.keyboard.up("ArrowLeft")
+    page.keyboard.press("e")
+    assert page.evaluate("stad.page.dream") is None
+
+
+def test_impatient_clicks_break_nothing(opened):
+    page = opened("dream")
+    page.evaluate(
+        """() => {
+            const buttons = [...document.querySelectorAll("#live button, #live input[type=radio]")]
+            for (let i = 0; i < 200; i++) buttons[(7 * i) % buttons.length].click()
+            for (const t of [479, 0, 300]) {
+                document.querySelector("#scrub").value = t
+                document.querySelector("#scrub").dispatchEvent(new Event("input", {bubbles: true}))
+                document.querySelector("#eyes").click()
+            }
+        }"""
+    )
+    page.wait_for_function("stad.page?.dream?.frames > 5 && stad.page.clock.running")
+    assert page.get_attribute("#live", "data-state") == "ready"
+
+
+def test_sliders_the_map_and_another_v_change_the_picture_and_reset_brings_it_back(opened):
+    page = opened("latent", reduced_motion="reduce")
+    picture = page.locator("#decoded")
+
+    def seen():
+        return picture.evaluate("canvas => canvas.toDataURL()")
+
+    first = seen()
+    pictures = [first]
+    for act in (
+        lambda: page.locator("#large input").first.press("End"),
+        lambda: page.locator("#map").press("Shift+ArrowUp"),
+        lambda: page.locator("#map").click(position={"x": 20, "y": 20}),
+        lambda: page.locator("#random").click(),
+    ):
+        act()
+        pictures.append(seen())
+    page.locator("#reset").click()
+    assert seen() == first
+    page.locator("input[value=frame]").press(" ")
+    page.wait_for_function("document.querySelector('#decodes-difference').innerText[0] === 'T'")
+    pictures.append(seen())
+    assert len(set(pictures)) == 6
+    page.locator("#scrub").press("ArrowRight")
+    page.wait_for_function("document.querySelector('#frame').ariaLabel === 'recorded frame 121'")
