@@ -13,6 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("TQDM_MININTERVAL", "1")
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -32,6 +33,10 @@ from stad_lab import Config, load_agent, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controller
 from stad_lab.models.controller import initial_parameters
+
+LIVE = Path(__file__).parent.parent / "docs" / "live"
+sys.path.insert(0, str(LIVE))
+import live_build  # noqa: E402
 
 torch.set_num_threads(1)  # the models here are tiny
 
@@ -204,3 +209,33 @@ def interrupt_after():
     yield interrupt
     for handle in handles:
         handle.remove()
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """The Chromium on the PATH, headless."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    found = next(filter(None, map(shutil.which, names)), None)
+    if not found:
+        pytest.skip("no chromium on the PATH: install it (Debian: apt-get install chromium)")
+    reason = "no playwright: pip install -r environment.txt"
+    playwright = pytest.importorskip("playwright.sync_api", reason=reason, exc_type=ImportError)
+    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=found, args=flags)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def live_pages(tmp_path_factory):
+    """A folder with the live pages as plain HTML, and all their scripts."""
+    folder = tmp_path_factory.mktemp("live")
+    live_build.write_scripts(folder)
+    for file in LIVE.glob("*.md"):
+        text = file.read_text(encoding="utf-8")
+        if body := re.search(r"```\{raw\} html\n(.*?)```", text, re.DOTALL):
+            head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>live</title>'
+            style = '<link rel="stylesheet" href="live.css"><body>'
+            (folder / f"{file.stem}.html").write_text(head + style + body[1], encoding="utf-8")
+    return folder

@@ -1,9 +1,6 @@
 """The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
 
-import re
 import secrets
-import shutil
-import sys
 from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
@@ -18,66 +15,24 @@ from stad_lab.models.controller import control
 from stad_lab.models.vae import to_array, to_tensor
 from stad_lab.play.session import Hand
 
-CHROMIUM = (
-    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-)
-if not CHROMIUM:
-    pytest.skip(
-        "no chromium on the PATH: install it (Debian: apt-get install chromium)",
-        allow_module_level=True,
-    )
-playwright = pytest.importorskip(
-    "playwright.sync_api",
-    reason="no playwright: pip install -r environment.txt",
-    exc_type=ImportError,
-)
-
-LIVE = Path(__file__).parent.parent / "docs" / "live"
-sys.path.insert(0, str(LIVE))
-import live_build  # noqa: E402
-
 CLOSE = 1e-5
 SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
 MEGABYTES = 6  # of a page, its scripts and its data
 
 
-@pytest.fixture(scope="module")
-def pages(tmp_path_factory):
-    """A folder with the pages as plain HTML, and all their scripts."""
-    folder = tmp_path_factory.mktemp("live")
-    live_build.write_scripts(folder)
-    for name in ("dream", "latent"):
-        text = (LIVE / f"{name}.md").read_text(encoding="utf-8")
-        body = re.search(r"```\{raw\} html\n(.*?)```", text, re.DOTALL)[1]
-        head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>live</title>'
-        style = '<link rel="stylesheet" href="live.css"><body>'
-        (folder / f"{name}.html").write_text(head + style + body, encoding="utf-8")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """One Chromium for all tests."""
-    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield browser
-        browser.close()
-
-
 @pytest.fixture
-def opened(browser, pages):
+def opened(chromium, live_pages):
     """A function that opens a page and waits until it is ready; no page may have an error."""
     errors, contexts = [], []
 
     def open_page(name, **context):
-        contexts.append(browser.new_context(**context))
+        contexts.append(chromium.new_context(**context))
         page = contexts[-1].new_page()
         page.set_default_timeout(SLOW)
         page.loaded = set()
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("request", lambda request: page.loaded.add(request.url))
-        page.goto((pages / f"{name}.html").as_uri())
+        page.goto((live_pages / f"{name}.html").as_uri())
         page.wait_for_selector("#live[data-state=ready]")
         return page
 

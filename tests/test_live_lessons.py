@@ -1,9 +1,7 @@
 """The live pages on speeds, the KL weight and evolution: opened from the disk in a Chromium."""
 
 import json
-import re
 import secrets
-import shutil
 import sys
 from pathlib import Path
 
@@ -17,20 +15,6 @@ from stad_lab.agent import Agent, load_agent, rollout
 from stad_lab.envs.cars import Cars
 from stad_lab.models.controller import control
 
-CHROMIUM = (
-    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-)
-if not CHROMIUM:
-    pytest.skip(
-        "no chromium on the PATH: install it (Debian: apt-get install chromium)",
-        allow_module_level=True,
-    )
-playwright = pytest.importorskip(
-    "playwright.sync_api",
-    reason="no playwright: pip install -r environment.txt",
-    exc_type=ImportError,
-)
-
 LIVE = Path(__file__).parent.parent / "docs" / "live"
 sys.path.insert(0, str(LIVE))
 import live_build  # noqa: E402
@@ -41,39 +25,15 @@ NAMES = ("speeds", "nat", "evolution")
 
 
 @pytest.fixture(scope="module")
-def pages(tmp_path_factory):
-    """A folder with the three pages as plain HTML, and all their scripts."""
-    folder = tmp_path_factory.mktemp("live")
-    live_build.write_scripts(folder)
-    for name in NAMES:
-        text = (LIVE / f"{name}.md").read_text(encoding="utf-8")
-        body = re.search(r"```\{raw\} html\n(.*?)```", text, re.DOTALL)[1]
-        head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>live</title>'
-        style = '<link rel="stylesheet" href="live.css"><body>'
-        (folder / f"{name}.html").write_text(head + style + body, encoding="utf-8")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """One Chromium for all tests."""
-    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def tabs(browser, pages):
+def tabs(chromium, live_pages):
     """A page in a tab of a phone's size by its name, and all errors and requests of the network."""
     errors, tabs = [], {}
     for name in NAMES:
-        page = tabs[name] = browser.new_page(viewport={"width": 360, "height": 740})
+        page = tabs[name] = chromium.new_page(viewport={"width": 360, "height": 740})
         page.set_default_timeout(SLOW)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
-        page.goto((pages / f"{name}.html").as_uri())
+        page.goto((live_pages / f"{name}.html").as_uri())
     return tabs, errors
 
 
