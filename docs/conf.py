@@ -47,7 +47,14 @@ include_patterns = [
     "notebooks/exercises/*.*",
     "stad_lab/pretrained/*/README.md",
 ]
-exclude_patterns = ["docs/_*", ".*", "runs", "**/.ipynb_checkpoints", "notebooks/exercises/*.py"]
+exclude_patterns = [
+    "docs/_*",
+    "**/node_modules",
+    ".*",
+    "runs",
+    "**/.ipynb_checkpoints",
+    "notebooks/exercises/*.py",
+]
 templates_path = [str(HERE / "_templates")]
 suppress_warnings = ["myst.header"]  # a cell may begin at the second heading level
 

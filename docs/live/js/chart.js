@@ -37,7 +37,9 @@ stad.Chart = class {
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     context.clearRect(0, 0, width, height);
     context.font = "12px system-ui, sans-serif";
-    const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(stad.color);
+    const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(
+      stad.color,
+    );
     const [left, right, top, bottom] = [36, width - 10, 22, height - 34];
     this.x = (value) => left + ((right - left) * value) / axes.xMax;
     this.y = (value) => bottom - ((bottom - top) * Math.min(value, axes.yMax)) / axes.yMax;
@@ -50,7 +52,10 @@ stad.Chart = class {
     context.strokeStyle = faint;
     context.lineWidth = 1;
     for (const value of ticks(axes.yMax, 3)) {
-      stroke([[left, this.y(value)], [right, this.y(value)]]);
+      stroke([
+        [left, this.y(value)],
+        [right, this.y(value)],
+      ]);
       text(String(value), left - 6, this.y(value) + 4, "right");
     }
     const wanted = Math.max(2, Math.floor(width / 90));
@@ -62,7 +67,10 @@ stad.Chart = class {
     for (const { y, text: words } of this.content.levels) {
       context.strokeStyle = ink;
       context.setLineDash([2, 3]);
-      stroke([[left, this.y(y)], [right, this.y(y)]]);
+      stroke([
+        [left, this.y(y)],
+        [right, this.y(y)],
+      ]);
       text(words, right, this.y(y) - 4, "right");
     }
     for (const { points, color, dash = [] } of this.content.lines) {
@@ -74,7 +82,10 @@ stad.Chart = class {
     context.setLineDash([]);
     for (const { x, text: words } of this.content.marks) {
       context.strokeStyle = stad.COLORS.red;
-      stroke([[this.x(x), top], [this.x(x), bottom]]);
+      stroke([
+        [this.x(x), top],
+        [this.x(x), bottom],
+      ]);
       const early = this.x(x) < (left + right) / 2;
       text(words, this.x(x) + (early ? 5 : -5), top + 10, early ? "left" : "right");
     }

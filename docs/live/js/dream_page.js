@@ -3,7 +3,7 @@
 
 stad.start(async () => {
   const AGENT = "input_output"; // its V decodes a difference image, too
-  const [BEGIN, SHOW_OFF, LONGEST] = [50, 150, 1000]; // frames: CarRacing zooms in until 50
+  const [BEGIN, SHOW_OFF, LONGEST] = [50, 100, 1000]; // frames: CarRacing zooms in until 50
   const LASTING = 10; // frames that dream and drive must be apart before we call them parted
   const COLORS = stad.COLORS;
   const get = stad.get;
@@ -20,11 +20,17 @@ stad.start(async () => {
   const hand = new stad.Hand();
   const clock = new stad.Clock(step, draw);
   const distanceChart = new stad.Chart(get("distance"), {
-    xMax: 200, yMax: 0.3, xLabel: "frames of the dream", yLabel: "RMS difference",
-  }); // prettier-ignore
+    xMax: 200,
+    yMax: 0.3,
+    xLabel: "frames of the dream",
+    yLabel: "RMS difference",
+  });
   const spreadChart = new stad.Chart(get("spread"), {
-    xMax: 200, yMax: 1.2, xLabel: "frames of the dream", yLabel: "standard deviation",
-  }); // prettier-ignore
+    xMax: 200,
+    yMax: 1.2,
+    xLabel: "frames of the dream",
+    yLabel: "standard deviation",
+  });
   const level = await typicalDistance();
 
   function step() {
@@ -124,7 +130,10 @@ stad.start(async () => {
     if (!dream) return;
     const at = `after ${dream.frames} frames`;
     stad.describe(get("distance"), `distance from the recorded drive ${at}: ${distance ?? "none"}`);
-    stad.describe(get("spread"), `spread of M's prediction ${at}: ${spreads.at(-1)?.[1].toFixed(2)}`);
+    stad.describe(
+      get("spread"),
+      `spread of M's prediction ${at}: ${spreads.at(-1)?.[1].toFixed(2)}`,
+    );
   }
 
   /** Begin a dream at the present frame, as soon as M remembers the drive up to it. */
@@ -140,8 +149,11 @@ stad.start(async () => {
     }
     [t, from] = [start, start];
     dream = new stad.Dream(
-      mdnRnn, memory.latents[from], memory.before[from], new stad.Random(seed++),
-    ); // prettier-ignore
+      mdnRnn,
+      memory.latents[from],
+      memory.before[from],
+      new stad.Random(seed++),
+    );
     dream.temperature = Number(get("temperature").value);
     hand.action.set(drive.action(from)); // the car goes on as it was
     [distances, spreads, parted] = [[], [], null];
@@ -171,6 +183,18 @@ stad.start(async () => {
     else setPlaying(true);
   }
 
+  /** Let V and M read the drive, in the background of a dream. */
+  async function readDrive() {
+    while (memory.length < drive.length) {
+      const begin = performance.now();
+      memory.advance();
+      const rest = 4 * (performance.now() - begin);
+      if (dream && clock.running) await new Promise((done) => setTimeout(done, rest));
+      else await stad.pause();
+    }
+    if (!clock.running) draw();
+  }
+
   /** Two frames of this drive that are a second apart differ by so much on average. */
   async function typicalDistance() {
     let [sum, count, i] = [0, 0, BEGIN];
@@ -195,17 +219,26 @@ stad.start(async () => {
   });
   get("eyes").addEventListener("click", toggleEyes);
   get("play").addEventListener("click", togglePlay);
-  get("again").addEventListener("click", touched(() => closeEyes(from)));
-  get("driver").addEventListener("change", touched(({ target }) => {
-    setDriver(target.value);
-    if (driver === "hand" && matchMedia("(hover: hover)").matches) get("seat").focus();
-  })); // prettier-ignore
-  get("scrub").addEventListener("input", touched(({ target }) => {
-    request++;
-    [dream, t] = [null, Number(target.value)];
-    setPlaying(false);
-    draw();
-  })); // prettier-ignore
+  get("again").addEventListener(
+    "click",
+    touched(() => closeEyes(from)),
+  );
+  get("driver").addEventListener(
+    "change",
+    touched(({ target }) => {
+      setDriver(target.value);
+      if (driver === "hand" && matchMedia("(hover: hover)").matches) get("seat").focus();
+    }),
+  );
+  get("scrub").addEventListener(
+    "input",
+    touched(({ target }) => {
+      request++;
+      [dream, t] = [null, Number(target.value)];
+      setPlaying(false);
+      draw();
+    }),
+  );
   get("temperature").addEventListener("input", ({ target }) => {
     get("temperature-value").textContent = Number(target.value).toFixed(2);
     if (dream) dream.temperature = Number(target.value);
@@ -218,9 +251,13 @@ stad.start(async () => {
     if (event.key === " ") togglePlay();
     else toggleEyes();
   });
-  stad.listenToPedals(hand, get("seat"), touched(() => {
-    if (driver !== "hand" || !dream) setDriver("hand");
-  })); // prettier-ignore
+  stad.listenToPedals(
+    hand,
+    get("seat"),
+    touched(() => {
+      if (driver !== "hand" || !dream) setDriver("hand");
+    }),
+  );
   addEventListener("gamepadconnected", ({ gamepad }) => {
     get("gamepad").textContent = `Gamepad found: ${gamepad.id}. Choose "You" to drive with it.`;
   });
@@ -231,15 +268,22 @@ stad.start(async () => {
   showCharts();
   setPlaying(untouched);
   [vae, mdnRnn, controller] = await Promise.all([
-    stad.VAE.load(AGENT), stad.MDNRNN.load(AGENT), stad.loadController(AGENT),
-  ]); // prettier-ignore
+    stad.VAE.load(AGENT),
+    stad.MDNRNN.load(AGENT),
+    stad.loadController(AGENT),
+  ]);
   memory = new stad.Memory(vae, mdnRnn, drive);
   get("eyes").disabled = false;
-  stad.page = { drive, vae, mdnRnn, controller, memory, clock, get dream() { return dream; } }; // prettier-ignore
-  stad
-    .inBackground(() => {
-      memory.advance();
-      return memory.length < drive.length;
-    })
-    .then(() => clock.running || draw(), stad.fail);
+  stad.page = {
+    drive,
+    vae,
+    mdnRnn,
+    controller,
+    memory,
+    clock,
+    get dream() {
+      return dream;
+    },
+  };
+  readDrive().catch(stad.fail);
 });

@@ -82,10 +82,11 @@ stad.Drive = class {
 {
   const size = stad.FRAME_SIZE;
   // Orange for brighter than before, purple for darker: matplotlib's PuOr_r, thinned out.
+  // prettier-ignore
   const COLORS = [
     [45, 0, 75], [84, 39, 136], [128, 115, 172], [178, 171, 210], [216, 218, 235], [247, 247, 247],
     [254, 224, 182], [253, 184, 99], [224, 130, 20], [179, 88, 6], [127, 59, 8],
-  ]; // prettier-ignore
+  ];
 
   function paint(canvas, colour) {
     const context = canvas.getContext("2d");

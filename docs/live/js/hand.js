@@ -11,7 +11,11 @@ stad.Hand = class {
 
   /** The next action, one small change from the last one. As stad_lab/play/session.py. */
   act() {
-    const [full, press, release] = [[1, 0.7, 0.8], [0.08, 0.04, 0.1], [0.16, 0.08, 0.4]];
+    const [full, press, release] = [
+      [1, 0.7, 0.8],
+      [0.08, 0.04, 0.1],
+      [0.16, 0.08, 0.4],
+    ];
     const pedals = new Set(this.held.values());
     const down = (pedal) => Number(pedals.has(pedal));
     [down("right") - down("left"), down("gas"), down("brake")].forEach((pressed, i) => {
@@ -39,9 +43,15 @@ stad.Hand = class {
 
 {
   const KEYS = {
-    ArrowLeft: "left", ArrowRight: "right", ArrowUp: "gas", ArrowDown: "brake",
-    KeyA: "left", KeyD: "right", KeyW: "gas", KeyS: "brake",
-  }; // prettier-ignore
+    ArrowLeft: "left",
+    ArrowRight: "right",
+    ArrowUp: "gas",
+    ArrowDown: "brake",
+    KeyA: "left",
+    KeyD: "right",
+    KeyW: "gas",
+    KeyS: "brake",
+  };
 
   /**
    * Let keys and buttons drive.

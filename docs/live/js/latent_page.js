@@ -49,7 +49,8 @@ stad.start(async () => {
     if (mine !== choice) return; // the reader has chosen another one meanwhile
     [variant, vae] = [name, loaded];
     buildSliders();
-    encode();
+    await stad.pause();
+    if (mine === choice) encode();
     stad.announce(`V is now ${name}.`);
   }
 
@@ -57,10 +58,16 @@ stad.start(async () => {
     sliders.clear();
     const sorted = order();
     axes = sorted.slice(0, 2);
-    for (const [id, some] of [["large", sorted.slice(0, LARGE)], ["rest", sorted.slice(LARGE)]]) {
+    for (const [id, some] of [
+      ["large", sorted.slice(0, LARGE)],
+      ["rest", sorted.slice(LARGE)],
+    ]) {
       get(id).replaceChildren(...some.map(slider));
     }
-    for (const [id, place] of [["across", 0], ["up", 1]]) {
+    for (const [id, place] of [
+      ["across", 0],
+      ["up", 1],
+    ]) {
       get(id).replaceChildren(
         ...sorted.map((i) => new Option(`z[${i}], ${kl(i).toFixed(2)} nats`, i)),
       );
@@ -237,7 +244,10 @@ stad.start(async () => {
     wave.play();
     get("wave").textContent = "Pause";
   });
-  for (const [id, place] of [["across", 0], ["up", 1]])
+  for (const [id, place] of [
+    ["across", 0],
+    ["up", 1],
+  ])
     get(id).addEventListener("change", ({ target }) => {
       axes[place] = Number(target.value);
       show();

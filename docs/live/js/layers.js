@@ -14,7 +14,10 @@ stad.linear = ({ shape: [outputs, inputs], data: weight }, { data: bias }) => {
     const y = new Float32Array(outputs);
     for (let o = 0; o < outputs; o++) {
       const row = o * inputs;
-      let [sum, sum1, sum2, sum3] = [bias[o], 0, 0, 0]; // four sums: the processor adds in parallel
+      let sum = bias[o]; // four sums, because the processor adds in parallel
+      let sum1 = 0;
+      let sum2 = 0;
+      let sum3 = 0;
       let i = 0;
       for (; i + 3 < inputs; i += 4) {
         sum += x[i] * weight[row + i];
@@ -66,7 +69,10 @@ stad.convolution = ({ shape: [outputs, inputs, kernel], data }, { data: bias }) 
 
 /** The sum of products of a kernel with the pixels below it; `run` is a multiple of 4. */
 stad.dotRows = (weight, run, rows) => (x, corner, line, start) => {
-  let [sum, sum1, sum2, sum3] = [0, 0, 0, 0];
+  let sum = 0; // `let [a, b] = [0, 0]` would halve the speed
+  let sum1 = 0;
+  let sum2 = 0;
+  let sum3 = 0;
   for (let row = 0, w = start; row < rows; row++)
     for (let p = corner + row * line, end = p + run; p < end; p += 4, w += 4) {
       sum += x[p] * weight[w];

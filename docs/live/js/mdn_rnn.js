@@ -37,8 +37,7 @@ stad.Mixture = class {
       let chosen = 0;
       while (chosen < this.mixtures - 1 && rest > weights[chosen]) rest -= weights[chosen++];
       const k = i * this.mixtures + chosen;
-      z[i] =
-        this.mean[k] + Math.exp(this.logsigma[k]) * Math.sqrt(temperature) * random.normal();
+      z[i] = this.mean[k] + Math.exp(this.logsigma[k]) * Math.sqrt(temperature) * random.normal();
     }
     return z;
   }

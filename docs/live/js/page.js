@@ -121,7 +121,7 @@ stad.Clock = class {
  * @param {number} slice milliseconds of work between two pauses
  */
 stad.inBackground = async (work, slice = 8) => {
-  for (let going = true; going; ) {
+  for (let going = true; going;) {
     const end = performance.now() + slice;
     while (going && performance.now() < end) going = work();
     await stad.pause();

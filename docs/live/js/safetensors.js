@@ -90,19 +90,23 @@ stad.data ??= {};
 
   /** Half precision (1 bit sign, 5 exponent, 10 fraction) as single precision, without rounding. */
   function halves(bits) {
+    // Exponent 0 is for numbers below 2^-14, without the leading 1. 31 (infinity) is not used.
+    const scale = Float64Array.from({ length: 32 }, (_, exponent) => 2 ** (exponent - 25));
+    scale[0] = scale[1];
     const values = new Float32Array(bits.length);
     for (let i = 0; i < bits.length; i++) {
       const exponent = (bits[i] >> 10) & 31;
-      const fraction = bits[i] & 1023;
-      // Exponent 0 is for numbers below 2^-14, without the leading 1. 31 (infinity) is not used.
-      const size = exponent ? (1024 + fraction) * 2 ** (exponent - 25) : fraction * 2 ** -24;
-      values[i] = bits[i] >> 15 ? -size : size;
+      const fraction = (bits[i] & 1023) + (exponent ? 1024 : 0);
+      values[i] = bits[i] >> 15 ? -fraction * scale[exponent] : fraction * scale[exponent];
     }
     return values;
   }
 
   /** The tensors of `data/NAME.js`. */
   stad.loadTensors = async (name) => {
-    return stad.readSafetensors(await stad.decodeBase64(await stad.load(name)));
+    const bytes = await stad.decodeBase64(await stad.load(name));
+    const tensors = stad.readSafetensors(bytes);
+    await stad.pause();
+    return tensors;
   };
 }
