@@ -21,12 +21,12 @@ MEGABYTES = 6  # of a page, its scripts and its data
 
 
 @pytest.fixture
-def opened(chromium, live_pages):
+def opened(browser, live_pages):
     """A function that opens a page and waits until it is ready; no page may have an error."""
     errors, contexts = [], []
 
     def open_page(name, **context):
-        contexts.append(chromium.new_context(**context))
+        contexts.append(browser.new_context(**context))
         page = contexts[-1].new_page()
         page.set_default_timeout(SLOW)
         page.loaded = set()

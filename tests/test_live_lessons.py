@@ -25,11 +25,11 @@ NAMES = ("speeds", "nat", "evolution")
 
 
 @pytest.fixture(scope="module")
-def tabs(chromium, live_pages):
+def tabs(browser, live_pages):
     """A page in a tab of a phone's size by its name, and all errors and requests of the network."""
     errors, tabs = [], {}
     for name in NAMES:
-        page = tabs[name] = chromium.new_page(viewport={"width": 360, "height": 740})
+        page = tabs[name] = browser.new_page(viewport={"width": 360, "height": 740})
         page.set_default_timeout(SLOW)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
