@@ -1,6 +1,11 @@
 """The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
 
+import json
+import re
 import secrets
+import shutil
+import subprocess
+import time
 from pathlib import Path
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
@@ -14,6 +19,8 @@ from stad_lab.config import VARIANTS
 from stad_lab.models.controller import control
 from stad_lab.models.vae import to_array, to_tensor
 from stad_lab.play.session import Hand
+
+LIVE = Path(__file__).parent.parent / "docs" / "live"
 
 CLOSE = 1e-5
 SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
@@ -48,6 +55,16 @@ def megabytes(page):
     assert all(one.startswith("file://") for one in loaded)
     files = [Path(url2pathname(urlsplit(one).path)) for one in loaded]
     return sum(file.stat().st_size for file in files) / 1e6
+
+
+@pytest.fixture(scope="module")
+def still_page(browser, live_pages):
+    """The page on the dream, where nothing moves by itself, for tests that only compute."""
+    page = browser.new_page(reduced_motion="reduce")
+    page.set_default_timeout(SLOW)
+    page.goto((live_pages / "dream.html").as_uri())
+    page.wait_for_selector("#live[data-state=ready]")
+    return page
 
 
 @pytest.fixture
@@ -121,8 +138,8 @@ DREAM_IN_THE_PAGE = """([z, uniforms, normals, temperature]) => {
 }"""
 
 
-def test_m_predicts_and_c_acts_as_in_python_over_200_steps(opened, rng):
-    page, agent = opened("dream", reduced_motion="reduce"), load_agent("input_output")
+def test_m_predicts_and_c_acts_as_in_python_over_200_steps(still_page, rng):
+    page, agent = still_page, load_agent("input_output")
     latents = rng.normal(0, 1, (200, 32)).astype(np.float32)
     actions = rng.uniform([-1, 0, 0], 1, (200, 3)).astype(np.float32)
     parameters = agent.parameters + rng.normal(0, 0.1, agent.parameters.shape)
@@ -174,19 +191,17 @@ def dream_in_python(agent, z, temperature, rng, steps):
     return np.array(rows), agent.vae.decode(torch.from_numpy(z)[None])[0], uniforms, normals
 
 
-def test_a_dream_of_200_steps_with_the_same_noise_is_that_of_python(opened, rng):
-    page, agent = opened("dream", reduced_motion="reduce"), load_agent("input_output")
-    page.wait_for_function("stad.page")
+def test_a_dream_of_200_steps_with_the_same_noise_is_that_of_python(still_page, rng):
+    agent = load_agent("input_output")
     z, temperature = rng.standard_normal(32).astype(np.float32), float(rng.uniform(0.3, 1.2))
     rows, frame, *noise = dream_in_python(agent, z, temperature, rng, 200)
-    steps, decoded = page.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, temperature])
+    steps, decoded = still_page.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, temperature])
     np.testing.assert_allclose(steps, rows, rtol=0, atol=CLOSE)
     np.testing.assert_allclose(decoded, to_array(frame).ravel(), rtol=0, atol=CLOSE)
-    assert megabytes(page) < MEGABYTES
 
 
-def test_held_keys_make_the_same_actions_as_in_the_package(opened, rng):
-    page, hand = opened("dream", reduced_motion="reduce"), Hand()
+def test_held_keys_make_the_same_actions_as_in_the_package(still_page, rng):
+    page, hand = still_page, Hand()
     held = [[p for p in ("left", "right", "gas", "brake") if rng.random() < 0.4] for _ in range(60)]
     found = page.evaluate(
         """(all) => {
@@ -227,7 +242,7 @@ def test_impatient_clicks_break_nothing(opened):
         """() => {
             const buttons = [...document.querySelectorAll("#live button, #live input[type=radio]")]
             for (let i = 0; i < 200; i++) buttons[(7 * i) % buttons.length].click()
-            for (const t of [479, 0, 300]) {
+            for (const t of [479, 0, 60]) {
                 document.querySelector("#scrub").value = t
                 document.querySelector("#scrub").dispatchEvent(new Event("input", {bubbles: true}))
                 document.querySelector("#eyes").click()
@@ -235,6 +250,7 @@ def test_impatient_clicks_break_nothing(opened):
         }"""
     )
     page.wait_for_function("stad.page?.dream?.frames > 5 && stad.page.clock.running")
+    assert megabytes(page) < MEGABYTES
     assert page.get_attribute("#live", "data-state") == "ready"
 
 
@@ -263,3 +279,108 @@ def test_sliders_the_map_and_another_v_change_the_picture_and_reset_brings_it_ba
     assert len(set(pictures)) == 6
     page.locator("#scrub").press("ArrowRight")
     page.wait_for_function("document.querySelector('#frame').ariaLabel === 'recorded frame 121'")
+
+
+class Firefox:
+    """The Firefox on the PATH, by WebDriver BiDi: Playwright drives only one of its own."""
+
+    def __init__(self, path, profile):
+        websocket = pytest.importorskip("websocket", reason="pip install -r environment.txt")
+        command = [path, "--headless", "--no-remote", "--profile", str(profile)]
+        self.process = subprocess.Popen(
+            [*command, "--remote-debugging-port=0"], stderr=subprocess.PIPE, text=True
+        )
+        told = (re.search(r"listening on (ws://\S+)", line) for line in self.process.stderr)
+        self.socket = websocket.create_connection(
+            next(filter(None, told))[1] + "/session", timeout=60, suppress_origin=True
+        )
+        self.number = 0
+        self.call("session.new", capabilities={})
+        self.tab = self.call("browsingContext.getTree")["contexts"][0]["context"]
+
+    def call(self, method, **parameters):
+        """One command; returns its result."""
+        self.number += 1
+        self.socket.send(json.dumps({"id": self.number, "method": method, "params": parameters}))
+        while (answer := json.loads(self.socket.recv())).get("id") != self.number:
+            pass
+        assert answer["type"] == "success", answer
+        return answer["result"]
+
+    def open(self, address):
+        """Open a page."""
+        self.call("browsingContext.navigate", context=self.tab, url=address, wait="complete")
+
+    def evaluate(self, function, argument=None):
+        """The value of a function, or of the promise that it returns, in the page."""
+        script = f"Promise.resolve(({function})({json.dumps(argument)})).then(JSON.stringify)"
+        target = {"context": self.tab}
+        found = self.call("script.evaluate", expression=script, target=target, awaitPromise=True)
+        assert found["type"] == "success", found
+        return json.loads(found["result"].get("value", "null"))
+
+    def close(self):
+        """End it."""
+        self.socket.close()
+        self.process.terminate()
+        self.process.wait(20)
+
+
+@pytest.fixture
+def firefox(tmp_path):
+    """A headless Firefox."""
+    path = shutil.which("firefox") or shutil.which("firefox-esr")
+    if not path:
+        pytest.skip("no firefox on the PATH: install it (Debian: apt-get install firefox-esr)")
+    one = Firefox(path, tmp_path)
+    yield one
+    one.close()
+
+
+READY = """async () => {
+    const errors = []
+    addEventListener("error", (event) => errors.push(event.message))
+    while (document.querySelector("#live").dataset.state === "loading")
+        await new Promise((done) => setTimeout(done, 20))
+    return [document.querySelector("#live").dataset.state, errors]
+}"""
+
+
+PRESS_ALL = """() => {
+    const errors = []
+    addEventListener("error", (event) => errors.push(event.message))
+    for (const button of document.querySelectorAll("#live button")) button.click()
+    for (const range of document.querySelectorAll("#live input[type=range]")) {
+        range.value = range.max
+        range.dispatchEvent(new Event("input", { bubbles: true }))
+    }
+    return [document.querySelector("#live").dataset.state, errors]
+}"""
+
+
+def test_firefox_opens_every_page_and_dreams_as_python(firefox, live_pages, rng):
+    agent = load_agent("input_output")
+    for name in ("latent", "nat", "evolution", "speeds", "dream"):
+        firefox.open((live_pages / f"{name}.html").as_uri())
+        assert firefox.evaluate(READY) == ["ready", []]
+        if name != "dream":
+            assert firefox.evaluate(PRESS_ALL) == ["ready", []]
+    rows, frame, *noise = dream_in_python(
+        agent, z := rng.standard_normal(32).astype(np.float32), 1.0, rng, 50
+    )
+    steps, decoded = firefox.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, 1.0])
+    np.testing.assert_allclose(steps, rows, rtol=0, atol=CLOSE)
+    np.testing.assert_allclose(decoded, to_array(frame).ravel(), rtol=0, atol=CLOSE)
+    state = "() => [stad.page.dream?.frames > 5, document.querySelector('#eyes').textContent]"
+    firefox.evaluate("() => document.querySelector('#eyes').click()")
+    deadline = time.monotonic() + SLOW / 1000
+    while firefox.evaluate(state) != [True, "Open the eyes"]:
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_the_scripts_are_linted_and_formatted():
+    if not (LIVE / "node_modules").exists() or not shutil.which("npm"):
+        pytest.skip("no eslint: npm install in docs/live")
+    run = subprocess.run(["npm", "run", "check"], cwd=LIVE, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout + run.stderr
