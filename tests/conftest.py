@@ -13,6 +13,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("TQDM_MININTERVAL", "1")
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -32,6 +33,10 @@ from stad_lab import Config, load_agent, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controller
 from stad_lab.models.controller import initial_parameters
+
+LIVE = Path(__file__).parent.parent / "docs" / "live"
+sys.path.insert(0, str(LIVE))
+import live_build  # noqa: E402
 
 torch.set_num_threads(1)  # the models here are tiny
 
@@ -182,6 +187,22 @@ def noted_tracks():
     return note
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """The Chromium on the PATH, headless. Playwright needs a loop, so asyncio.run comes before."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = next(filter(None, map(shutil.which, names)), None)
+    if not path:
+        pytest.skip("no chromium on the PATH: install it (Debian: apt-get install chromium)")
+    api = pytest.importorskip("playwright.sync_api", reason="pip install -r environment.txt")
+    flags = ["--no-sandbox", "--disable-gpu", "--no-first-run"]
+    flags += ["--disable-background-networking", "--disable-component-update"]
+    with api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=path, headless=True, args=flags)
+        yield chromium
+        chromium.close()
+
+
 @pytest.fixture
 def interrupt_after():
     """A function that raises KeyboardInterrupt after so many updates of a training.
@@ -204,3 +225,17 @@ def interrupt_after():
     yield interrupt
     for handle in handles:
         handle.remove()
+
+
+@pytest.fixture(scope="module")
+def live_pages(tmp_path_factory):
+    """A folder with the live pages as plain HTML, and all their scripts."""
+    folder = tmp_path_factory.mktemp("live")
+    live_build.write_scripts(folder)
+    for file in LIVE.glob("*.md"):
+        text = file.read_text(encoding="utf-8")
+        if body := re.search(r"```\{raw\} html\n(.*?)```", text, re.DOTALL):
+            head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>live</title>'
+            style = '<link rel="stylesheet" href="live.css"><body>'
+            (folder / f"{file.stem}.html").write_text(head + style + body[1], encoding="utf-8")
+    return folder

@@ -5,7 +5,6 @@ import re
 import secrets
 import shutil
 import subprocess
-import sys
 import time
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -21,55 +20,15 @@ from stad_lab.models.controller import control
 from stad_lab.models.vae import to_array, to_tensor
 from stad_lab.play.session import Hand
 
-CHROMIUM = (
-    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-)
-if not CHROMIUM:
-    pytest.skip(
-        "no chromium on the PATH: install it (Debian: apt-get install chromium)",
-        allow_module_level=True,
-    )
-playwright = pytest.importorskip(
-    "playwright.sync_api",
-    reason="no playwright: pip install -r environment.txt",
-    exc_type=ImportError,
-)
-
 LIVE = Path(__file__).parent.parent / "docs" / "live"
-sys.path.insert(0, str(LIVE))
-import live_build  # noqa: E402
 
 CLOSE = 1e-5
 SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
 MEGABYTES = 6  # of a page, its scripts and its data
 
 
-@pytest.fixture(scope="module")
-def pages(tmp_path_factory):
-    """A folder with the pages as plain HTML, and all their scripts."""
-    folder = tmp_path_factory.mktemp("live")
-    live_build.write_scripts(folder)
-    for name in ("dream", "latent"):
-        text = (LIVE / f"{name}.md").read_text(encoding="utf-8")
-        body = re.search(r"```\{raw\} html\n(.*?)```", text, re.DOTALL)[1]
-        head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>live</title>'
-        style = '<link rel="stylesheet" href="live.css"><body>'
-        (folder / f"{name}.html").write_text(head + style + body, encoding="utf-8")
-    return folder
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """One Chromium for all tests."""
-    flags = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=flags)
-        yield browser
-        browser.close()
-
-
 @pytest.fixture
-def opened(browser, pages):
+def opened(browser, live_pages):
     """A function that opens a page and waits until it is ready; no page may have an error."""
     errors, contexts = [], []
 
@@ -80,7 +39,7 @@ def opened(browser, pages):
         page.loaded = set()
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on("request", lambda request: page.loaded.add(request.url))
-        page.goto((pages / f"{name}.html").as_uri())
+        page.goto((live_pages / f"{name}.html").as_uri())
         page.wait_for_selector("#live[data-state=ready]")
         return page
 
@@ -99,11 +58,11 @@ def megabytes(page):
 
 
 @pytest.fixture(scope="module")
-def still_page(browser, pages):
+def still_page(browser, live_pages):
     """The page on the dream, where nothing moves by itself, for tests that only compute."""
     page = browser.new_page(reduced_motion="reduce")
     page.set_default_timeout(SLOW)
-    page.goto((pages / "dream.html").as_uri())
+    page.goto((live_pages / "dream.html").as_uri())
     page.wait_for_selector("#live[data-state=ready]")
     return page
 
@@ -387,12 +346,25 @@ READY = """async () => {
 }"""
 
 
-def test_firefox_opens_both_pages_and_dreams_as_python(firefox, pages, rng):
+PRESS_ALL = """() => {
+    const errors = []
+    addEventListener("error", (event) => errors.push(event.message))
+    for (const button of document.querySelectorAll("#live button")) button.click()
+    for (const range of document.querySelectorAll("#live input[type=range]")) {
+        range.value = range.max
+        range.dispatchEvent(new Event("input", { bubbles: true }))
+    }
+    return [document.querySelector("#live").dataset.state, errors]
+}"""
+
+
+def test_firefox_opens_every_page_and_dreams_as_python(firefox, live_pages, rng):
     agent = load_agent("input_output")
-    firefox.open((pages / "latent.html").as_uri())
-    assert firefox.evaluate(READY) == ["ready", []]
-    firefox.open((pages / "dream.html").as_uri())
-    assert firefox.evaluate(READY) == ["ready", []]
+    for name in ("latent", "nat", "evolution", "speeds", "dream"):
+        firefox.open((live_pages / f"{name}.html").as_uri())
+        assert firefox.evaluate(READY) == ["ready", []]
+        if name != "dream":
+            assert firefox.evaluate(PRESS_ALL) == ["ready", []]
     rows, frame, *noise = dream_in_python(
         agent, z := rng.standard_normal(32).astype(np.float32), 1.0, rng, 50
     )

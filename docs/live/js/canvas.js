@@ -1,0 +1,39 @@
+"use strict";
+// Drawings in CSS pixels, sharp on every screen.
+globalThis.stad ??= {};
+
+/**
+ * Clear a canvas and fit it to its size on the page.
+ * @param {HTMLCanvasElement} canvas
+ * @returns {{context: CanvasRenderingContext2D, width: number, height: number} | null} in CSS
+ *   pixels; null while the canvas has no size
+ */
+stad.clearCanvas = (canvas) => {
+  const [width, height] = [canvas.clientWidth, canvas.clientHeight];
+  if (!width || !height) return null;
+  const ratio = devicePixelRatio || 1;
+  const size = [Math.round(width * ratio), Math.round(height * ratio)];
+  if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+  const context = canvas.getContext("2d");
+  context.setTransform(ratio, 0, 0, ratio, 0, 0);
+  context.clearRect(0, 0, width, height);
+  context.font = "12px system-ui, sans-serif";
+  return { context, width, height };
+};
+
+/** Draw a line through points [x, y]. */
+stad.strokeLine = (context, points, color, width = 2) => {
+  context.strokeStyle = color;
+  context.lineWidth = width;
+  context.beginPath();
+  for (const [x, y] of points) context.lineTo(x, y);
+  context.stroke();
+};
+
+/** Fill a circle. */
+stad.fillDot = (context, [x, y], radius, color) => {
+  context.fillStyle = color;
+  context.beginPath();
+  context.arc(x, y, radius, 0, 2 * Math.PI);
+  context.fill();
+};

@@ -1,0 +1,231 @@
+"use strict";
+// The page "Evolution", upper part: the generations of a real CMA-ES run, on the track and in M.
+
+stad.start(async () => {
+  const AGENT = "cropped_input"; // whose run it is
+  const [run, tensors, vae, mdnRnn] = await Promise.all([
+    stad.load("evolution"),
+    stad.loadTensors("evolution_tensors"),
+    stad.VAE.load(AGENT),
+    stad.MDNRNN.load(AGENT),
+  ]);
+  const generations = run.generations; // those whose mean controllers are here
+  const [{ shape }, last] = [tensors.controllers, generations.length - 1];
+  const controllers = generations.map((_, i) =>
+    tensors.controllers.data.subarray(i * shape[1], (i + 1) * shape[1]),
+  );
+  const slider = stad.get("generation");
+  let [chosen, which] = [0, 0];
+
+  // The track
+
+  const tracks = run.tracks.map((facts, number) => {
+    const paths = pairs(tensors[`paths.${number}`].data);
+    let begin = 0;
+    return {
+      ...facts,
+      road: pairs(tensors[`road.${number}`].data),
+      paths: facts.points.map((count) => paths.slice(begin, (begin += count))),
+    };
+  });
+  let moment = 0; // of the dot, in points of the path
+
+  function pairs(data) {
+    return Array.from({ length: data.length / 2 }, (_, i) => [data[2 * i], data[2 * i + 1]]);
+  }
+
+  /** World units to pixels: the whole road and some grass around it; y points up. */
+  function projection({ road }, width) {
+    const [xs, ys] = [0, 1].map((k) => road.map((point) => point[k]));
+    const [left, right, low, high] = [
+      Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys),
+    ]; // prettier-ignore
+    const scale = width / (Math.max(right - left, high - low) + 50);
+    return {
+      scale,
+      place: ([x, y]) => [
+        width / 2 + scale * (x - (left + right) / 2),
+        width / 2 - scale * (y - (low + high) / 2),
+      ],
+    };
+  }
+
+  let background = null; // the road and all paths, painted once for a size, track and theme
+
+  function drawTrack() {
+    const canvas = stad.get("track");
+    const cleared = stad.clearCanvas(canvas);
+    if (!cleared) return;
+    const { context, width } = cleared;
+    const track = tracks[which];
+    const { place } = projection(track, width);
+    const key = [which, canvas.width, stad.color("--color-background-primary")].join();
+    if (background?.key !== key) background = { key, picture: paintBackground(canvas, width) };
+    context.drawImage(background.picture, 0, 0, width, width);
+    const path = track.paths[chosen];
+    const points = path.map(place);
+    stad.strokeLine(context, points.slice(0, Math.ceil(moment) + 1), stad.COLORS.orange, 2.5);
+    stad.strokeLine(context, points, "rgba(230, 159, 0, 0.55)", 1.5);
+    stad.fillDot(context, points[Math.min(points.length - 1, Math.floor(moment))], 5, "#c00000");
+  }
+
+  function paintBackground(canvas, width) {
+    const picture = document.createElement("canvas");
+    [picture.width, picture.height] = [canvas.width, canvas.height];
+    const context = picture.getContext("2d");
+    context.scale(canvas.width / width, canvas.width / width);
+    const track = tracks[which];
+    const { place, scale } = projection(track, width);
+    context.lineJoin = "round";
+    const road = [...track.road, track.road[0]].map(place);
+    stad.strokeLine(context, road, "#8a8a8a", 2 * run.half_width * scale);
+    for (const path of track.paths)
+      stad.strokeLine(context, path.map(place), "rgba(0, 114, 178, 0.22)", 1);
+    stad.fillDot(context, road[0], 4, "white");
+    return picture;
+  }
+
+  // The learning curve
+
+  const count = run.mean.length;
+  const line = (values, color) => ({ points: values.map((value, i) => [i + 1, value]), color });
+  const validation = Object.entries(run.validation).map(([n, value]) => [Number(n), value]);
+  const curve = new stad.Chart(stad.get("learning"), {
+    xMax: count,
+    yMax: 1000,
+    xLabel: "generation",
+    yLabel: "return",
+  });
+
+  // The dream
+
+  const random = new stad.Random(1);
+  const starts = tensors["start.z"].shape[0];
+  let [dream, start] = [null, 0];
+
+  function beginDream() {
+    const row = (name) => {
+      const [, size] = tensors[name].shape;
+      return tensors[name].data.slice(start * size, (start + 1) * size);
+    };
+    dream = new stad.Dream(
+      mdnRnn,
+      row("start.z"),
+      { h: row("start.h"), c: row("start.c") },
+      random,
+    );
+    drawDream();
+  }
+
+  function drawDream() {
+    stad.paintFrame(stad.get("dream"), vae.decode(dream.z).frame);
+    const seconds = (dream.frames / 50).toFixed(1);
+    stad.get("dream-text").textContent = `generation ${generations[chosen]}, ${seconds} s`;
+    stad.describe(
+      stad.get("dream"),
+      `M's dream, driven by the mean controller of generation ${generations[chosen]}, after ${seconds} seconds.`,
+    );
+  }
+
+  const LONGEST = 600; // frames of a dream, then another one begins
+  const clock = new stad.Clock(
+    () => {
+      if (dream.frames >= LONGEST) nextDream();
+      dream.step(stad.control(controllers[chosen], dream.z, dream.state.h));
+      moment += 1; // a tenth of a second of the drive in a fiftieth
+      if (moment > tracks[which].paths[chosen].length + 60) moment = 0; // after a rest at the end
+    },
+    () => {
+      drawDream();
+      drawTrack();
+    },
+  );
+
+  function nextDream() {
+    start = (start + 1) % starts;
+    beginDream();
+  }
+
+  // The generation
+
+  function show() {
+    const [generation, track] = [generations[chosen], tracks[which]];
+    slider.value = chosen;
+    stad.get("generation-value").textContent = generation;
+    slider.setAttribute("aria-valuetext", `generation ${generation}`);
+    const [points, frames] = [track.returns[chosen], track.frames[chosen]];
+    const seconds = (frames / 50).toFixed(0);
+    const end = track.laps[chosen]
+      ? `a whole lap in ${seconds} seconds`
+      : frames < 1000
+        ? `it left the field after ${seconds} seconds`
+        : "no whole lap in 20 seconds";
+    const driven = generation * run.episodes;
+    const text = `Generation ${generation}: ${points.toFixed(0)} points, ${end}.`;
+    stad.get("summary").textContent =
+      `${text} ${driven.toLocaleString("en")} episodes were driven for it.`;
+    stad.announce(text);
+    stad.describe(
+      stad.get("track"),
+      `Track ${"AB"[which]} from above. ${text} All generations' paths are drawn faintly.`,
+    );
+    curve.show({
+      lines: [
+        line(run.worst, "#999999"),
+        line(run.best, stad.COLORS.orange),
+        line(run.mean, stad.COLORS.blue),
+        { points: validation, color: stad.COLORS.green },
+      ],
+      marks: [{ x: generation, text: `generation ${generation}` }],
+    });
+    const shown = generation ? run.mean[generation - 1] : null;
+    stad.describe(
+      stad.get("learning"),
+      `Return over ${count} generations. The average candidate's rises from ${run.mean[0].toFixed(0)} to ${run.mean.at(-1).toFixed(0)}.` +
+        (shown === null ? "" : ` In generation ${generation}: ${shown.toFixed(0)}.`),
+    );
+    drawTrack();
+  }
+
+  let timer = 0;
+  function choose(number) {
+    chosen = Math.min(last, Math.max(0, number));
+    moment = 0;
+    if (stad.prefersStill()) moment = Infinity; // the whole path at once
+    beginDream();
+    show();
+  }
+  function stop() {
+    clearInterval(timer);
+    timer = 0;
+    stad.get("play").textContent = "Play";
+  }
+  const setDream = (on) => {
+    if (on) clock.play();
+    else clock.pause();
+    stad.get("dream-play").textContent = on ? "Pause" : "Drive";
+  };
+
+  slider.max = last;
+  slider.addEventListener("input", () => {
+    stop();
+    choose(Number(slider.value));
+  });
+  stad.get("which").addEventListener("change", (event) => {
+    which = Number(event.target.value);
+    moment = 0;
+    show();
+  });
+  stad.get("play").addEventListener("click", () => {
+    if (timer) return stop();
+    stad.get("play").textContent = "Pause";
+    if (chosen === last) choose(0);
+    timer = setInterval(() => (chosen === last ? stop() : choose(chosen + 1)), 2500);
+  });
+  stad.get("dream-play").addEventListener("click", () => setDream(!clock.running));
+  stad.get("dream-again").addEventListener("click", nextDream);
+  new ResizeObserver(drawTrack).observe(stad.get("track"));
+  stad.onTheme(drawTrack);
+  choose(generations.indexOf(5));
+  setDream(!stad.prefersStill());
+});
