@@ -7,6 +7,7 @@ again. Neither the build nor the pages need a network.
 
 import hashlib
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -76,13 +77,14 @@ html_theme = "furo"
 html_title = "stad_lab"
 html_static_path = [str(HERE / "_static")]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_show_copyright = False
 html_show_sphinx = False
 html_additional_pages = {"index": "to_start.html"}
 html_copy_source = False
 html_show_sourcelink = False
-pygments_style = "friendly"
-pygments_dark_style = "github-dark"
+pygments_style = "a11y-high-contrast-light"
+pygments_dark_style = "a11y-high-contrast-dark"
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
 
@@ -100,6 +102,15 @@ def explain_widgets(app, doctree) -> None:
             )
 
 
+def help_screen_readers(app, page, template, context, doctree) -> None:
+    """Give the sidebar's headings their level, and make an empty header cell an ordinary one."""
+    for part in {"body", "furo_navigation_tree"} & context.keys():
+        leveled = context[part].replace('role="heading"', 'role="heading" aria-level="2"')
+        context[part] = re.sub(
+            r"<th([^>]*)>(\s*(?:<p></p>)?\s*)</th>", r"<td\1>\2</td>", leveled
+        )
+
+
 def check_site(app, error) -> None:
     """Report each fault of the built site as a warning, which `-W` makes an error."""
     if error is None and app.builder.name == "html":
@@ -108,6 +119,7 @@ def check_site(app, error) -> None:
 
 
 def setup(app) -> None:
-    """Connect both; the check runs last, after MathJax has been copied."""
+    """Connect them; the check runs last, after MathJax has been copied."""
     app.connect("doctree-read", explain_widgets)
+    app.connect("html-page-context", help_screen_readers, priority=900)  # the theme's come first
     app.connect("build-finished", check_site, priority=900)
