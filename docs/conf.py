@@ -106,9 +106,7 @@ def help_screen_readers(app, page, template, context, doctree) -> None:
     """Give the sidebar's headings their level, and make an empty header cell an ordinary one."""
     for part in {"body", "furo_navigation_tree"} & context.keys():
         leveled = context[part].replace('role="heading"', 'role="heading" aria-level="2"')
-        context[part] = re.sub(
-            r"<th([^>]*)>(\s*(?:<p></p>)?\s*)</th>", r"<td\1>\2</td>", leveled
-        )
+        context[part] = re.sub(r"<th([^>]*)>(\s*(?:<p></p>)?\s*)</th>", r"<td\1>\2</td>", leveled)
 
 
 def check_site(app, error) -> None:

@@ -182,6 +182,22 @@ def noted_tracks():
     return note
 
 
+@pytest.fixture(scope="module")
+def browser():
+    """The Chromium on the PATH, headless. Playwright needs a loop, so asyncio.run comes before."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = next(filter(None, map(shutil.which, names)), None)
+    if not path:
+        pytest.skip("no chromium on the PATH: install it (Debian: apt-get install chromium)")
+    api = pytest.importorskip("playwright.sync_api", reason="pip install -r environment.txt")
+    flags = ["--no-sandbox", "--disable-gpu", "--no-first-run"]
+    flags += ["--disable-background-networking", "--disable-component-update"]
+    with api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=path, headless=True, args=flags)
+        yield chromium
+        chromium.close()
+
+
 @pytest.fixture
 def interrupt_after():
     """A function that raises KeyboardInterrupt after so many updates of a training.
