@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.util import logging
 
 from stad_lab.config import PRESET_VARIABLE
@@ -87,19 +88,32 @@ pygments_style = "a11y-high-contrast-light"
 pygments_dark_style = "a11y-high-contrast-dark"
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
+PROGRESS = "%|"  # of tqdm, beside the widget
+LIVE = {"00": "dream", "01": "speeds", "02": "latent", "03": "dream", "04": "evolution"}
 
 
 def explain_widgets(app, doctree) -> None:
-    """Replace each widget by a note: without a kernel there is nothing to move."""
+    """Replace each widget by a note, which leads to the live page of its notebook if it has one.
+
+    A progress bar is a widget, too: it goes, as its end is known.
+    """
+    notebook = Path(app.env.docname).name[:2]
     for bundle in list(doctree.findall(nodes.container)):
         if any(
             isinstance(child, nodes.container) and child.get("mime_type") == WIDGET
             for child in bundle.children
         ):
+            if PROGRESS in bundle.astext():
+                bundle.parent.remove(bundle)
+                continue
             text = "This widget needs a running kernel: open the notebook in JupyterLab."
-            bundle.replace_self(
-                nodes.container("", nodes.paragraph("", text), classes=["without-kernel"])
-            )
+            note = nodes.paragraph("", text)
+            if notebook in LIVE:
+                page = {"reftype": "doc", "reftarget": f"/docs/live/{LIVE[notebook]}"}
+                page |= {"refdomain": "std", "refexplicit": False, "refdoc": app.env.docname}
+                link = addnodes.pending_xref("", nodes.inline(), **page)
+                note += [nodes.Text(" Or try this live page: "), link, nodes.Text(".")]
+            bundle.replace_self(nodes.container("", note, classes=["without-kernel"]))
 
 
 def help_screen_readers(app, page, template, context, doctree) -> None:

@@ -38,6 +38,7 @@ CELLS = (
     "from stad_lab.viz.widgets import explore, show, show_animation, slider\n"
     "figure = Figure(figsize=(1, 1))\nfigure.set_label('an empty square')\nshow(figure)",
     "explore(lambda x: figure, x=slider(0, 1, 0, 'x'))",
+    "from tqdm.auto import tqdm\nlist(tqdm([1]))",
     "import numpy as np\nfrom stad_lab.viz.video import animate_pictures\n"
     "film = animate_pictures({'x': np.zeros((3, 64, 64, 3), np.uint8)})\n"
     "show_animation(film, 'a black film')",
@@ -77,11 +78,12 @@ def site(tmp_path_factory):
     for name, file in PAGES.items():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(file, source / name)
-    (source / "notebooks" / "small.ipynb").write_text(small_notebook(*CELLS))
+    (source / "notebooks" / "00_small.ipynb").write_text(small_notebook(*CELLS))
+    notebooks = [f"notebooks/{file.name}" for file in (ROOT / "notebooks").glob("0*.ipynb")]
     out = source / "docs" / "_build" / "site"
     (source / "conf.py").write_text(
         f"import sys\nsys.path.insert(0, {str(ROOT / 'docs')!r})\nfrom conf import *\n"
-        "nb_execution_excludepatterns += ['notebooks/[0-9]*']\n"
+        f"nb_execution_excludepatterns += {notebooks}\n"
         f"nb_execution_cache_path = {str(source / 'cache')!r}\n"
     )
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", source, out]
@@ -185,14 +187,15 @@ def test_every_notebook_and_module_has_its_page_and_the_index_of_words_is_there(
     assert "notebooks/02_difference_autoencoders" in index
 
 
-def test_a_notebook_that_runs_shows_its_figure_and_a_note_instead_of_its_widget(site):
-    page = (site[0] / "notebooks" / "small.html").read_text(encoding="utf-8")
+def test_a_notebook_that_runs_shows_its_figure_and_a_live_page_instead_of_its_widget(site):
+    page = (site[0] / "notebooks" / "00_small.html").read_text(encoding="utf-8")
     assert 'alt="an empty square"' in page and "data:image/png;base64," in page
-    assert 'class="without-kernel' in page and "VBox(" not in page
+    assert page.count('class="without-kernel') == 1 and "VBox(" not in page and "%|" not in page
+    assert 'href="../docs/live/dream.html"' in page
 
 
 def test_formulas_come_from_the_site_itself(site):
-    page = (site[0] / "notebooks" / "small.html").read_text(encoding="utf-8")
+    page = (site[0] / "notebooks" / "00_small.html").read_text(encoding="utf-8")
     assert "\\alpha_t" in page and "mathjax/tex-chtml.js" in page and "cdn." not in page
     assert (site[0] / "_static" / "mathjax" / "tex-chtml.js").exists()
     assert list((site[0] / "_static" / "mathjax").rglob("MathJax_Main-Regular.woff"))
@@ -267,7 +270,7 @@ def test_axe_finds_nothing_serious_in_the_reference_of_any_module(site, browser)
 def test_a_film_can_be_paused_and_begins_still_for_who_wants_no_motion(site, browser):
     for motion, begins in (("no-preference", "Pause"), ("reduce", "Play")):
         page = browser.new_page(reduced_motion=motion)
-        page.goto((site[0] / "notebooks" / "small.html").as_uri())
+        page.goto((site[0] / "notebooks" / "00_small.html").as_uri())
         for label in (begins, {"Pause": "Play", "Play": "Pause"}[begins]):
             button = page.get_by_role("button", name=f"{label} the film")
             assert page.get_by_role("img", name="a black film").evaluate("one => one.tagName") == (
