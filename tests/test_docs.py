@@ -54,8 +54,9 @@ THIN = """() => {
         let kind = ""
         for (let one = text.parentElement; one; one = one.parentElement)
             kind += `${one.tagName}.${one.getAttribute("class")}[${one.getAttribute("style")}]`
-        if (seen.has(kind)) text.remove()
-        seen.add(kind)
+        if (!seen.has(kind)) seen.add(kind)
+        else if (text.parentElement.childNodes.length > 1) text.remove()
+        else text.parentElement.remove()
     }
 }"""
 
