@@ -7,10 +7,12 @@ again. Neither the build nor the pages need a network.
 
 import hashlib
 import os
+import re
 import sys
 from pathlib import Path
 
 from docutils import nodes
+from sphinx import addnodes
 from sphinx.util import logging
 
 from stad_lab.config import PRESET_VARIABLE
@@ -84,28 +86,49 @@ html_theme = "furo"
 html_title = "stad_lab"
 html_static_path = [str(HERE / "_static")]
 html_css_files = ["site.css"]
+html_js_files = ["site.js"]
 html_show_copyright = False
 html_show_sphinx = False
 html_additional_pages = {"index": "to_start.html"}
 html_copy_source = False
 html_show_sourcelink = False
-pygments_style = "friendly"
-pygments_dark_style = "github-dark"
+pygments_style = "a11y-high-contrast-light"
+pygments_dark_style = "a11y-high-contrast-dark"
 
 WIDGET = "application/vnd.jupyter.widget-view+json"
+PROGRESS = "%|"  # of tqdm, beside the widget
+LIVE = {"00": "dream", "01": "speeds", "02": "latent", "03": "dream", "04": "evolution"}
 
 
 def explain_widgets(app, doctree) -> None:
-    """Replace each widget by a note: without a kernel there is nothing to move."""
+    """Replace each widget by a note, which leads to the live page of its notebook if it has one.
+
+    A progress bar is a widget, too: it goes, as its end is known.
+    """
+    notebook = Path(app.env.docname).name[:2]
     for bundle in list(doctree.findall(nodes.container)):
         if any(
             isinstance(child, nodes.container) and child.get("mime_type") == WIDGET
             for child in bundle.children
         ):
+            if PROGRESS in bundle.astext():
+                bundle.parent.remove(bundle)
+                continue
             text = "This widget needs a running kernel: open the notebook in JupyterLab."
-            bundle.replace_self(
-                nodes.container("", nodes.paragraph("", text), classes=["without-kernel"])
-            )
+            note = nodes.paragraph("", text)
+            if notebook in LIVE:
+                page = {"reftype": "doc", "reftarget": f"/docs/live/{LIVE[notebook]}"}
+                page |= {"refdomain": "std", "refexplicit": False, "refdoc": app.env.docname}
+                link = addnodes.pending_xref("", nodes.inline(), **page)
+                note += [nodes.Text(" Or try this live page: "), link, nodes.Text(".")]
+            bundle.replace_self(nodes.container("", note, classes=["without-kernel"]))
+
+
+def help_screen_readers(app, page, template, context, doctree) -> None:
+    """Give the sidebar's headings their level, and make an empty header cell an ordinary one."""
+    for part in {"body", "furo_navigation_tree"} & context.keys():
+        leveled = context[part].replace('role="heading"', 'role="heading" aria-level="2"')
+        context[part] = re.sub(r"<th([^>]*)>(\s*(?:<p></p>)?\s*)</th>", r"<td\1>\2</td>", leveled)
 
 
 def style_live_page(app, page, template, context, doctree) -> None:
@@ -128,8 +151,9 @@ def check_site(app, error) -> None:
 
 
 def setup(app) -> None:
-    """Connect both; the check runs last, after MathJax has been copied."""
+    """Connect them; the check runs last, after MathJax has been copied."""
     app.connect("doctree-read", explain_widgets)
     app.connect("html-page-context", style_live_page)
     app.connect("build-finished", write_live_scripts)
+    app.connect("html-page-context", help_screen_readers, priority=900)  # the theme's come first
     app.connect("build-finished", check_site, priority=900)

@@ -278,6 +278,8 @@ def shipped_agents() -> list[str]:
 
 def run_folder(source: str | Path) -> Path:
     """The folder of an agent: that of a shipped one by its name, or the folder of a run."""
+    if not isinstance(source, str | Path):
+        raise ValueError(f"agent {source!r}: expected a shipped agent's name or a run's folder")
     shipped = PRETRAINED / source
     return shipped if isinstance(source, str) and shipped.is_dir() and source else Path(source)
 

@@ -78,7 +78,11 @@ def benchmark(parts: list[str], rounds: int = 5, file: Path | None = None) -> di
         known = f"choose from {', '.join(PARTS)}, with 1 round or more"
         raise ValueError(f"parts={unknown or list(parts)}, rounds={rounds}: {known}")
     command = f"python -m stad_lab benchmark --parts {' '.join(parts)} --rounds {rounds}"
-    result = {"made_with": provenance(command) | {"trained_on": "cpu"}, "rounds": rounds}
+    result = {
+        "kind": "benchmark",
+        "made_with": provenance(command) | {"trained_on": "cpu"},
+        "rounds": rounds,
+    }
     for part in parts:
         result[part] = PARTS[part](rounds)
         print(f"\n{part}")

@@ -456,9 +456,11 @@ def benchmark(
         json: Where to write every measurement.
     """
     from stad_lab.benchmark import PARTS, benchmark
+    from stad_lab.evaluation.evaluate import check_output
     from stad_lab.io.files import check_writable
 
     check_writable(json)
+    check_output(json)
     benchmark(list(parts) or list(PARTS), rounds, json)
     print(f"\nevery measurement: {json}")
 

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 PRESET_VARIABLE = "STAD_LAB_PRESET"
-VARIANTS = ("frame", "input", "output", "input_output")
+VARIANTS = ("frame", "input", "output", "input_output")  # those of the paper
 SMALLEST_SIGMA = 1e-12  # near 0 CMA-ES cannot compute
 
 # (lowest, highest) value of fields; any other int is at least 1, any other float above 0.

@@ -321,6 +321,8 @@ def test_an_agent_that_is_not_there_is_an_error_that_names_the_choices(tmp_path)
         )
         with pytest.raises(FileNotFoundError, match=message):
             load_agent(source)
+    with pytest.raises(ValueError, match="agent None: expected a shipped agent's name or"):
+        load_agent(None)
 
 
 def test_a_name_is_a_shipped_agent_and_a_path_is_a_folder(tmp_path, monkeypatch):

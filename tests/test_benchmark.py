@@ -89,6 +89,13 @@ def test_what_is_measured_is_kept_though_a_later_part_fails(tmp_path, monkeypatc
     assert "parity" in load_json(tmp_path / "benchmark.json")
 
 
+def test_a_file_of_a_run_is_not_overwritten(tmp_path, capsys):
+    file = tmp_path / "evolution.json"
+    file.write_text("{}")
+    assert main(["benchmark", "--json", str(file)]) == 2
+    assert "choose another name" in capsys.readouterr().err and file.read_text() == "{}"
+
+
 def test_the_training_of_v_and_m_is_timed(tmp_path):
     brief = {"vae": {"steps": 7}, "mdn_rnn": {"steps": M_STEPS, "batch": 2}}
     config = Config.preset("quick", variant="input", **brief)

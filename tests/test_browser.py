@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -15,24 +14,8 @@ from pathlib import Path
 
 import pytest
 
-CHROMIUM = (
-    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-)
-if not CHROMIUM:
-    pytest.skip(
-        "no chromium on the PATH: install it (Debian: apt-get install chromium)",
-        allow_module_level=True,
-    )
-playwright = pytest.importorskip(
-    "playwright.sync_api",
-    reason="no playwright: pip install -r environment.txt",
-    exc_type=ImportError,
-)
-
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 SLOW = 180  # seconds to wait for anything: a busy machine is no fault
-FLAGS = ["--no-sandbox", "--disable-gpu", "--no-first-run"]
-FLAGS += ["--disable-background-networking", "--disable-component-update"]
 
 
 @pytest.fixture(scope="module")
@@ -86,15 +69,6 @@ def lab(tmp_path_factory):
     yield address, folder
     server.send_signal(signal.SIGTERM)
     server.wait(20)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """One Chromium for all tests."""
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

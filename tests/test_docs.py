@@ -35,10 +35,30 @@ PRIVATE = (
 )
 CELLS = (
     "from matplotlib.figure import Figure\n"
-    "from stad_lab.viz.widgets import explore, show, slider\n"
+    "from stad_lab.viz.widgets import explore, show, show_animation, slider\n"
     "figure = Figure(figsize=(1, 1))\nfigure.set_label('an empty square')\nshow(figure)",
     "explore(lambda x: figure, x=slider(0, 1, 0, 'x'))",
+    "from tqdm.auto import tqdm\nlist(tqdm([1]))",
+    "import numpy as np\nfrom stad_lab.viz.video import animate_pictures\n"
+    "film = animate_pictures({'x': np.zeros((3, 64, 64, 3), np.uint8)})\n"
+    "show_animation(film, 'a black film')",
+    "import pandas\npandas.DataFrame({f'a long name {n}': [n] for n in range(20)})",
 )
+SERIOUS = {"serious", "critical"}  # impacts of axe
+# axe's rule on contrast is slow. Ink and paper follow from tags, classes and styles, so of all
+# texts that have these alike, up to the root, one stays.
+THIN = """() => {
+    const seen = new Set(), texts = [], all = document.createTreeWalker(document.body, 4)
+    while (all.nextNode()) if (all.currentNode.data.trim()) texts.push(all.currentNode)
+    for (const text of texts) {
+        let kind = ""
+        for (let one = text.parentElement; one; one = one.parentElement)
+            kind += `${one.tagName}.${one.getAttribute("class")}[${one.getAttribute("style")}]`
+        if (!seen.has(kind)) seen.add(kind)
+        else if (text.parentElement.childNodes.length > 1) text.remove()
+        else text.parentElement.remove()
+    }
+}"""
 
 
 def small_notebook(*sources):
@@ -59,11 +79,12 @@ def site(tmp_path_factory):
     for name, file in PAGES.items():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(file, source / name)
-    (source / "notebooks" / "small.ipynb").write_text(small_notebook(*CELLS))
+    (source / "notebooks" / "00_small.ipynb").write_text(small_notebook(*CELLS))
+    notebooks = [f"notebooks/{file.name}" for file in (ROOT / "notebooks").glob("0*.ipynb")]
     out = source / "docs" / "_build" / "site"
     (source / "conf.py").write_text(
         f"import sys\nsys.path.insert(0, {str(ROOT / 'docs')!r})\nfrom conf import *\n"
-        "nb_execution_excludepatterns += ['notebooks/[0-9]*']\n"
+        f"nb_execution_excludepatterns += {notebooks}\n"
         f"nb_execution_cache_path = {str(source / 'cache')!r}\n"
     )
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", source, out]
@@ -167,14 +188,15 @@ def test_every_notebook_and_module_has_its_page_and_the_index_of_words_is_there(
     assert "notebooks/02_difference_autoencoders" in index
 
 
-def test_a_notebook_that_runs_shows_its_figure_and_a_note_instead_of_its_widget(site):
-    page = (site[0] / "notebooks" / "small.html").read_text(encoding="utf-8")
+def test_a_notebook_that_runs_shows_its_figure_and_a_live_page_instead_of_its_widget(site):
+    page = (site[0] / "notebooks" / "00_small.html").read_text(encoding="utf-8")
     assert 'alt="an empty square"' in page and "data:image/png;base64," in page
-    assert 'class="without-kernel' in page and "VBox(" not in page
+    assert page.count('class="without-kernel') == 1 and "VBox(" not in page and "%|" not in page
+    assert 'href="../docs/live/dream.html"' in page
 
 
 def test_formulas_come_from_the_site_itself(site):
-    page = (site[0] / "notebooks" / "small.html").read_text(encoding="utf-8")
+    page = (site[0] / "notebooks" / "00_small.html").read_text(encoding="utf-8")
     assert "\\alpha_t" in page and "mathjax/tex-chtml.js" in page and "cdn." not in page
     assert (site[0] / "_static" / "mathjax" / "tex-chtml.js").exists()
     assert list((site[0] / "_static" / "mathjax").rglob("MathJax_Main-Regular.woff"))
@@ -191,3 +213,69 @@ def test_the_check_of_the_site_finds_each_kind_of_fault(tmp_path):
     assert len(found) == 4
     for what in ("alternative text", "a missing anchor", "a missing file", "the network"):
         assert sum(what in fault for fault in found) == 1
+
+
+def violations(page, part, **options):
+    """What axe holds against a part of a page: (rule, theme, where, why) for each element."""
+    run = "([part, options]) => axe.run(part, options).then(found => found.violations)"
+    found = page.evaluate(run, [part, options | {"resultTypes": ["violations"], "preload": False}])
+    theme = page.evaluate("document.body.dataset.theme")
+    return [
+        (rule["id"], theme, element["target"], element["failureSummary"])
+        for rule in found
+        for element in rule["nodes"]
+        if rule["impact"] in SERIOUS
+    ]
+
+
+def all_violations(page, file):
+    """What axe holds against a file of the site, in both themes."""
+    page.goto(file.as_uri())
+    page.evaluate("window.MathJax?.startup?.promise.then(() => 0)")
+    page.evaluate("document.body.dataset.theme = 'light'")
+    part = "html" if file.stem == "index" else "article"  # the sidebar is alike everywhere
+    found = violations(page, part, rules={"color-contrast": {"enabled": False}})
+    page.evaluate(THIN)
+    for theme in ("light", "dark"):
+        page.evaluate(f"document.body.dataset.theme = '{theme}'")
+        found += violations(page, part, runOnly=["color-contrast"])
+    return [(file.name, *one) for one in found]
+
+
+def check_accessible(files, browser):
+    """Let axe check the pages at a phone's width, where most blocks scroll."""
+    from axe_playwright_python.base import AXE_SCRIPT
+
+    page = browser.new_page(viewport={"width": 360, "height": 700})
+    page.add_init_script(AXE_SCRIPT)
+    assert [one for file in files for one in all_violations(page, file)] == []
+    page.close()
+
+
+def written_pages(folder):
+    """The pages of a site but for the start, which leads on, and those of all modules but one."""
+    pages = set(folder.rglob("*.html")) - {folder / "index.html"}
+    modules = sorted((folder / "docs" / "modules").glob("*.html"))
+    return sorted(pages - set(modules[1:])), modules[1:]
+
+
+def test_axe_finds_nothing_serious_in_either_theme(site, browser):
+    check_accessible(written_pages(site[0])[0], browser)
+
+
+@pytest.mark.long
+def test_axe_finds_nothing_serious_in_the_reference_of_any_module(site, browser):
+    check_accessible(written_pages(site[0])[1], browser)
+
+
+def test_a_film_can_be_paused_and_begins_still_for_who_wants_no_motion(site, browser):
+    for motion, begins in (("no-preference", "Pause"), ("reduce", "Play")):
+        page = browser.new_page(reduced_motion=motion)
+        page.goto((site[0] / "notebooks" / "00_small.html").as_uri())
+        for label in (begins, {"Pause": "Play", "Play": "Pause"}[begins]):
+            button = page.get_by_role("button", name=f"{label} the film")
+            assert page.get_by_role("img", name="a black film").evaluate("one => one.tagName") == (
+                "IMG" if label == "Pause" else "CANVAS"
+            )
+            button.press("Enter")
+        page.close()

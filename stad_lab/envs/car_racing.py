@@ -4,6 +4,8 @@ Returns, rewards and endings are those of Gymnasium's own CarRacing-v3, bit for 
 differs by less than 0.3 of 255 on average. To drive many cars at once, see `envs.vector`.
 """
 
+import inspect
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.box2d import car_dynamics
@@ -30,7 +32,17 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
     Returns:
         An environment with observations uint8 (96, 96, 3) and actions float32 (3,): steering in
         [-1, 1], gas and brake in [0, 1]. An episode is cut at 1,000 frames.
+
+    Raises:
+        ValueError: an option that the environment does not have.
     """
+    options = inspect.signature(CarRacing if fast else reference.CarRacing).parameters
+    options = [*options, "max_episode_steps", "disable_env_checker"]
+    if unknown := [name for name in kwargs if name not in options]:
+        raise ValueError(
+            f"make_env: unknown {', '.join(unknown)}; choose from {', '.join(options)}. The seed of"
+            " a track belongs to reset: env.reset(seed=1)"
+        )
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
 
 

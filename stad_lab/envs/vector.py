@@ -81,8 +81,8 @@ class CarRacingVector(gym.vector.VectorEnv):
         """
         self._check_open()
         options = options or {}
-        mask = options.get("reset_mask", np.ones(self.num_envs, bool))
-        if np.shape(mask) != (self.num_envs,) or not np.any(mask):
+        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
+        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
             raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), one at least")
         if seed is None or isinstance(seed, int | np.integer):
             seed = [None if seed is None else seed + car for car in range(self.num_envs)]

@@ -117,7 +117,7 @@ def check_output(path: Path) -> None:
             kind = load_json(path).get("kind")
         except ValueError:
             kind = "damaged"
-        if kind not in (KIND, "probe"):
+        if kind not in (KIND, "probe", "benchmark"):
             raise ValueError(f"{path} exists and is no earlier result: choose another name")
 
 

@@ -16,7 +16,12 @@ import numpy as np
 import torch
 from torch import nn
 
-VARIANTS = ("frame", "input", "output", "input_output")
+VARIANTS = {  # whether V sees, and whether it reconstructs, the difference image
+    "frame": (False, False),
+    "input": (True, False),
+    "output": (False, True),
+    "input_output": (True, True),
+}
 LOGVAR_RANGE = (-10.0, 10.0)
 SHARPNESS = 5.0  # of a soft bound: 0.5 inside it, a value moves by 0.02
 
@@ -25,7 +30,7 @@ class VAE(nn.Module):
     """V: pictures -> latent z -> pictures.
 
     Args:
-        variant: "frame", "input", "output" or "input_output".
+        variant: one of VARIANTS.
         latent_size: dimensions of z.
         width: channels of the first convolution (World Models: 32).
     """
@@ -35,8 +40,7 @@ class VAE(nn.Module):
         if variant not in VARIANTS:
             raise ValueError(f"unknown variant {variant!r}: choose one of {', '.join(VARIANTS)}")
         self.variant, self.latent_size, self.width = variant, latent_size, width
-        self.sees_difference = variant in ("input", "input_output")
-        self.reconstructs_difference = variant in ("output", "input_output")
+        self.sees_difference, self.reconstructs_difference = VARIANTS[variant]
         self.encoder = nn.Sequential(
             nn.Conv2d(6 if self.sees_difference else 3, width, 4, stride=2),  # 64 -> 31 pixels
             nn.ReLU(inplace=True),

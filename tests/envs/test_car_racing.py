@@ -20,6 +20,12 @@ from stad_lab.training.dataset import RandomDriver
 GAS = np.array([0, 1, 0], np.float32)
 
 
+@pytest.mark.parametrize("fast", [True, False])
+def test_an_unknown_option_is_refused_in_one_line_that_says_where_a_seed_belongs(fast):
+    with pytest.raises(ValueError, match=r"unknown seed; choose from .*env.reset\(seed=1\)"):
+        make_env(fast, seed=1)
+
+
 def drive_both(actions, seed, **kwargs):
     """The same episode in both environments: two lists of what `reset` and `step` returned."""
     found = []

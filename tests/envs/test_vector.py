@@ -89,8 +89,8 @@ def test_with_autoreset_off_the_mask_says_who_begins_anew():
     assert_equal(found[0][0], found[1][0])
 
 
-@pytest.mark.parametrize("mask", [[False] * CARS, [True]])
-def test_a_mask_that_fits_no_car_is_refused(mask):
+@pytest.mark.parametrize("mask", [[False] * CARS, [True], [2] + [0] * (CARS - 1)])
+def test_a_mask_of_no_car_of_another_shape_or_of_numbers_is_refused(mask):
     envs = CarRacingVector(CARS, autoreset_mode="Disabled")
     envs.reset(seed=0)
     with pytest.raises(ValueError, match="reset_mask"):
