@@ -40,7 +40,7 @@ stad.Chart = class {
     const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(
       stad.color,
     );
-    const [left, right, top, bottom] = [36, width - 10, 22, height - 34];
+    const [left, right, top, bottom] = [36, width - 16, 22, height - 34];
     this.x = (value) => left + ((right - left) * value) / axes.xMax;
     this.y = (value) => bottom - ((bottom - top) * Math.min(value, axes.yMax)) / axes.yMax;
 

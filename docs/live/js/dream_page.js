@@ -41,6 +41,7 @@ stad.start(async () => {
     }
     if (dream.frames >= LONGEST) return setPlaying(false);
     const now = from + dream.frames;
+    if (driver !== "hand" && stad.readGamepad()) setDriver("hand");
     let action = hand.action;
     if (driver === "hand") action = hand.act();
     else if (driver === "recorded" && now < drive.length) action = drive.action(now);
@@ -99,7 +100,7 @@ stad.start(async () => {
     const wheel = { agent: "C drives", hand: "you drive", recorded: "recorded actions" }[driver];
     const over = dream && from + dream.frames >= drive.length;
     set("t", `${t}${over ? ", the recording has ended" : ""}`);
-    set("dream-name", dream ? "The dream" : memory?.latents[t] ? "V's reconstruction" : "Seen");
+    set("dream-name", dream ? "The dream" : memory?.latents[t] ? "Reconstruction" : "Seen");
     set("dream-note", dream ? `frame ${dream.frames}, ${wheel}` : "The eyes are open.");
     set("eyes", dream ? "Open the eyes" : "Close the eyes here");
     set("scrub-value", String(t));
@@ -125,7 +126,7 @@ stad.start(async () => {
       dream
         ? `the dream, frame ${dream.frames}, ${wheel}, ${pedals}` +
             (distance ? `, distance from the recorded drive ${distance}` : "")
-        : `V's reconstruction of frame ${t}, ${pedals}`,
+        : `reconstruction of frame ${t} by V, ${pedals}`,
     );
     if (!dream) return;
     const at = `after ${dream.frames} frames`;
@@ -259,7 +260,8 @@ stad.start(async () => {
     }),
   );
   addEventListener("gamepadconnected", ({ gamepad }) => {
-    get("gamepad").textContent = `Gamepad found: ${gamepad.id}. Choose "You" to drive with it.`;
+    get("gamepad").textContent =
+      `Gamepad found (${gamepad.id}): its stick and triggers drive the dream.`;
   });
 
   // The drive plays at once; V and M are loaded and read it meanwhile.

@@ -2,6 +2,17 @@
 // The reader at the wheel, with keys, touch pedals or a gamepad.
 globalThis.stad ??= {};
 
+/** Stick and triggers of the first gamepad that is in use: they need no smoothing. */
+stad.readGamepad = () => {
+  for (const pad of navigator.getGamepads?.() ?? []) {
+    if (!pad || pad.axes.length < 1) continue;
+    const steering = Math.abs(pad.axes[0]) < 0.1 ? 0 : pad.axes[0]; // a stick never rests at 0
+    const [gas, brake] = [7, 6].map((button) => pad.buttons[button]?.value ?? 0);
+    if (steering || gas || brake) return [steering, gas, brake];
+  }
+  return null;
+};
+
 /** Pedals as a driver. Keys are binary and steering is continuous, so the action is smoothed. */
 stad.Hand = class {
   constructor() {
@@ -24,20 +35,9 @@ stad.Hand = class {
       const step = towards ? press[i] : release[i];
       this.action[i] += Math.max(-step, Math.min(step, wanted - now));
     });
-    const gamepad = readGamepad();
+    const gamepad = stad.readGamepad();
     if (gamepad) this.action.set(gamepad);
     return this.action.slice();
-
-    /** Stick and triggers of the first gamepad that is in use: they need no smoothing. */
-    function readGamepad() {
-      for (const pad of navigator.getGamepads?.() ?? []) {
-        if (!pad || pad.axes.length < 1) continue;
-        const steering = Math.abs(pad.axes[0]) < 0.1 ? 0 : pad.axes[0]; // a stick never rests at 0
-        const [gas, brake] = [7, 6].map((button) => pad.buttons[button]?.value ?? 0);
-        if (steering || gas || brake) return [steering, gas, brake];
-      }
-      return null;
-    }
   }
 };
 
