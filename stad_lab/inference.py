@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from llvmlite import ir
 from numba.core import types
+from numba.core.cgutils import ir
 from numba.extending import intrinsic
 
 from stad_lab.envs.compiling import compiled
