@@ -1,5 +1,6 @@
 """The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
 
+import copy
 import json
 import re
 import secrets
@@ -126,7 +127,7 @@ DREAM_IN_THE_PAGE = """([z, uniforms, normals, temperature]) => {
     const { mdnRnn, controller, vae } = stad.page
     const [uniform, normal] = [uniforms, normals].map((numbers) => () => numbers.shift())
     const dream = new stad.Dream(
-        mdnRnn, Float32Array.from(z), mdnRnn.emptyState(), { uniform, normal })
+        mdnRnn, Float64Array.from(z), mdnRnn.emptyState(), { uniform, normal })
     dream.temperature = temperature
     const steps = []
     while (normals.length) {
@@ -165,18 +166,19 @@ def test_m_predicts_and_c_acts_as_in_python_over_200_steps(still_page, rng):
 
 @torch.no_grad()
 def dream_in_python(agent, z, temperature, rng, steps):
-    """A dream with C: z and action of every step, and the random numbers that chose them.
+    """A dream with C: z and action of every step, the last frame, and the random numbers used.
 
-    No uniform number is so close to a boundary that rounding could choose another Gaussian.
+    M is in double precision, as in the page: a dream amplifies the rounding of float32, in one of
+    ten to more than 1e-5. No uniform number is so close to a boundary between two Gaussians that
+    rounding could choose the other one.
     """
-    zeros = torch.zeros(1, 1, 256)
+    m, zeros = copy.deepcopy(agent.mdn_rnn).double(), torch.zeros(1, 1, 256, dtype=torch.float64)
     state, rows, uniforms, normals = (zeros, zeros), [], [], []
     for _ in range(steps):
         action = control(agent.parameters, np.concatenate([z, state[0][0, 0].numpy()])[None])[0]
-        mixture, state = agent.mdn_rnn(
-            torch.from_numpy(z)[None, None], torch.from_numpy(action)[None, None], state
-        )
-        logpi, mean, logsigma = (part[0, 0].double() for part in mixture)
+        given = (torch.from_numpy(one)[None, None] for one in (z, action.astype(float)))
+        mixture, state = m(*given, state)
+        logpi, mean, logsigma = (part[0, 0] for part in mixture)
         bounds = (logpi / temperature).softmax(-1).cumsum(-1).numpy()
         uniform = rng.uniform(size=32)
         while (close := np.abs(bounds - uniform[:, None]).min(axis=1) < 1e-4).any():
@@ -184,16 +186,16 @@ def dream_in_python(agent, z, temperature, rng, steps):
         chosen = (uniform[:, None] > bounds[:, :-1]).sum(axis=1)
         normal, row = rng.standard_normal(32), np.arange(32)
         sigma = logsigma.exp().numpy()[row, chosen] * np.sqrt(temperature)
-        z = (mean.numpy()[row, chosen] + sigma * normal).astype(np.float32)
+        z = mean.numpy()[row, chosen] + sigma * normal
         rows.append([*z, *action])
         uniforms += uniform.tolist()
         normals += normal.tolist()
-    return np.array(rows), agent.vae.decode(torch.from_numpy(z)[None])[0], uniforms, normals
+    return np.array(rows), agent.vae.decode(torch.tensor(z).float()[None])[0], uniforms, normals
 
 
 def test_a_dream_of_200_steps_with_the_same_noise_is_that_of_python(still_page, rng):
     agent = load_agent("input_output")
-    z, temperature = rng.standard_normal(32).astype(np.float32), float(rng.uniform(0.3, 1.2))
+    z, temperature = rng.standard_normal(32), float(rng.uniform(0.3, 1.2))
     rows, frame, *noise = dream_in_python(agent, z, temperature, rng, 200)
     steps, decoded = still_page.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, temperature])
     np.testing.assert_allclose(steps, rows, rtol=0, atol=CLOSE)
@@ -234,6 +236,16 @@ def test_the_reader_closes_the_eyes_drives_and_opens_them_with_the_keyboard_alon
     page.keyboard.up("ArrowLeft")
     page.keyboard.press("e")
     assert page.evaluate("stad.page.dream") is None
+    page.locator("#eyes").click()  # after a click the arrow keys steer at once
+    page.check("input[value=agent]")
+    page.locator("#again").click()
+    page.locator("#seat").press("ArrowRight")
+    assert page.is_checked("input[value=hand]")
+    page.locator("#play").focus()  # and they steer wherever the focus is
+    page.keyboard.down("ArrowUp")
+    assert page.locator("button[data-pedal=gas].held").count() == 1
+    page.keyboard.up("ArrowUp")
+    page.keyboard.press("Escape")
 
 
 def test_impatient_clicks_break_nothing(opened):
@@ -365,9 +377,7 @@ def test_firefox_opens_every_page_and_dreams_as_python(firefox, live_pages, rng)
         assert firefox.evaluate(READY) == ["ready", []]
         if name != "dream":
             assert firefox.evaluate(PRESS_ALL) == ["ready", []]
-    rows, frame, *noise = dream_in_python(
-        agent, z := rng.standard_normal(32).astype(np.float32), 1.0, rng, 50
-    )
+    rows, frame, *noise = dream_in_python(agent, z := rng.standard_normal(32), 1.0, rng, 50)
     steps, decoded = firefox.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, 1.0])
     np.testing.assert_allclose(steps, rows, rtol=0, atol=CLOSE)
     np.testing.assert_allclose(decoded, to_array(frame).ravel(), rtol=0, atol=CLOSE)

@@ -6,8 +6,8 @@ globalThis.stad ??= {};
 /**
  * The action for z and M's memory h.
  * @param {Float64Array} parameters weights (3, z and h) and then 3 biases
- * @param {Float32Array} z
- * @param {Float32Array} h
+ * @param {ArrayLike<number>} z
+ * @param {ArrayLike<number>} h
  * @returns {Float32Array} steering in [-1, 1], gas and brake in [0, 1]
  */
 stad.control = (parameters, z, h) => {

@@ -8,8 +8,8 @@ globalThis.stad ??= {};
 stad.Dream = class {
   /**
    * @param {stad.MDNRNN} mdnRnn
-   * @param {Float32Array} z the first one, for example V's of a real frame
-   * @param {{h: Float32Array, c: Float32Array}} state M's memory of all frames before
+   * @param {ArrayLike<number>} z the first one, for example that of a real frame
+   * @param {{h: Float64Array, c: Float64Array}} state M's memory of all frames before
    * @param {{uniform: () => number, normal: () => number}} random
    */
   constructor(mdnRnn, z, state, random) {

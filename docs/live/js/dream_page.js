@@ -15,6 +15,7 @@ stad.start(async () => {
   let untouched = !stad.prefersStill(); // the first dream begins by itself
   let request = 0; // number of the last wish to close the eyes: a newer one replaces it
   let [distances, spreads, parted] = [[], [], null];
+  let others = []; // distances of earlier dreams from the same frame
   let [vae, mdnRnn, controller, memory] = [null, null, null, null];
 
   const hand = new stad.Hand();
@@ -84,7 +85,10 @@ stad.start(async () => {
 
   function showCharts() {
     distanceChart.show({
-      lines: [{ points: distances, color: COLORS.orange }],
+      lines: [
+        ...others.map((points) => ({ points, color: "#8887" })),
+        { points: distances, color: COLORS.orange },
+      ],
       levels: [{ y: level, text: "1 s apart" }],
       marks: parted === null ? [] : [{ x: parted, text: `parted: ${parted}` }],
     });
@@ -148,6 +152,7 @@ stad.start(async () => {
         if (wish !== request) return;
       }
     }
+    others = start === from ? [...others, distances].slice(-8) : [];
     [t, from] = [start, start];
     dream = new stad.Dream(
       mdnRnn,
@@ -189,6 +194,7 @@ stad.start(async () => {
     while (memory.length < drive.length) {
       const begin = performance.now();
       memory.advance();
+      if (memory.length === t + 1 && !clock.running) draw();
       const rest = 4 * (performance.now() - begin);
       if (dream && clock.running) await new Promise((done) => setTimeout(done, rest));
       else await stad.pause();
@@ -213,7 +219,12 @@ stad.start(async () => {
     untouched = false;
     act(event);
   };
-  const toggleEyes = touched(() => (dream ? openEyes() : closeEyes()));
+  const toggleEyes = touched((event) => {
+    if (dream) return openEyes();
+    closeEyes();
+    if (event.detail > 0) sit(); // a click; who uses the keyboard keeps the focus
+  });
+  const sit = () => get("seat").focus({ preventScroll: true });
   const togglePlay = touched(() => {
     if (!clock.running && dream?.frames >= LONGEST) openEyes();
     setPlaying(!clock.running);
@@ -226,10 +237,7 @@ stad.start(async () => {
   );
   get("driver").addEventListener(
     "change",
-    touched(({ target }) => {
-      setDriver(target.value);
-      if (driver === "hand" && matchMedia("(hover: hover)").matches) get("seat").focus();
-    }),
+    touched(({ target }) => setDriver(target.value)),
   );
   get("scrub").addEventListener(
     "input",
@@ -244,21 +252,23 @@ stad.start(async () => {
     get("temperature-value").textContent = Number(target.value).toFixed(2);
     if (dream) dream.temperature = Number(target.value);
   });
+  get("driver").addEventListener("click", ({ target, detail }) => {
+    if (detail > 0 && target.value === "hand") sit();
+  });
   get("seat").addEventListener("keydown", (event) => {
+    if (event.key === "Escape") document.activeElement.blur(); // arrow keys move the page again
     if (event.target.matches("button") || event.ctrlKey || event.altKey || event.metaKey) return;
     if (event.key !== " " && event.key.toLowerCase() !== "e") return;
     event.preventDefault();
     if (event.repeat) return;
     if (event.key === " ") togglePlay();
-    else toggleEyes();
+    else toggleEyes(event);
   });
-  stad.listenToPedals(
-    hand,
-    get("seat"),
-    touched(() => {
-      if (driver !== "hand" || !dream) setDriver("hand");
-    }),
-  );
+  const take = touched(() => {
+    if (driver !== "hand" || !dream) setDriver("hand");
+  });
+  const drives = () => driver === "hand" && dream && clock.running;
+  stad.listenToPedals(hand, get("seat"), take, drives);
   addEventListener("gamepadconnected", ({ gamepad }) => {
     get("gamepad").textContent =
       `Gamepad found (${gamepad.id}): its stick and triggers drive the dream.`;

@@ -58,8 +58,9 @@ stad.Hand = class {
    * @param {stad.Hand} hand
    * @param {Element} seat keys drive while the focus is in it; its buttons have data-pedal
    * @param {() => void} take called when the reader presses a pedal
+   * @param {() => boolean} drives whether keys drive outside the seat, too
    */
-  stad.listenToPedals = (hand, seat, take) => {
+  stad.listenToPedals = (hand, seat, take, drives) => {
     const hold = (source, pedal) => {
       hand.held.set(source, pedal);
       mark();
@@ -79,11 +80,12 @@ stad.Hand = class {
     };
     const buttons = [...seat.querySelectorAll("[data-pedal]")];
 
-    seat.addEventListener("keydown", (event) => {
+    document.addEventListener("keydown", (event) => {
+      if (!seat.contains(event.target) && !drives()) return;
       if (event.ctrlKey || event.altKey || event.metaKey) return;
       const pressed = event.key === " " || event.key === "Enter";
       const pedal = KEYS[event.code] ?? (pressed ? event.target.dataset?.pedal : undefined);
-      if (!pedal || event.target.matches("input, select")) return;
+      if (!pedal || event.target.matches("input, select, textarea")) return;
       event.preventDefault(); // arrow keys would move the page
       if (!event.repeat) hold(event.code, pedal);
     });

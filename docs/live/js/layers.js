@@ -7,11 +7,16 @@ globalThis.stad ??= {};
  * y = W x + b, as torch.nn.Linear.
  * @param {{shape: number[], data: Float32Array}} weight of shape (outputs, inputs)
  * @param {{data: Float32Array}} bias
+ * @param Numbers kind of array for y
  * @returns {(x: Float32Array) => Float32Array}
  */
-stad.linear = ({ shape: [outputs, inputs], data: weight }, { data: bias }) => {
+stad.linear = (
+  { shape: [outputs, inputs], data: weight },
+  { data: bias },
+  Numbers = Float32Array,
+) => {
   return (x) => {
-    const y = new Float32Array(outputs);
+    const y = new Numbers(outputs);
     for (let o = 0; o < outputs; o++) {
       const row = o * inputs;
       let sum = bias[o]; // four sums, because the processor adds in parallel

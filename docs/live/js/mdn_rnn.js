@@ -1,10 +1,11 @@
 "use strict";
 // M, the MDN-RNN: an LSTM that predicts the next z as a mixture of Gaussians.
-// The same as stad_lab/models/mdn_rnn.py, with its weights, for one car and one step.
+// The same as stad_lab/models/mdn_rnn.py, with its weights, for one car and one step. It computes in
+// double precision: a dream feeds M with its own output, which amplifies every rounding.
 globalThis.stad ??= {};
 
 stad.Mixture = class {
-  /** @param {Float32Array} output of M's head: logits, means and logsigmas, (latents, mixtures) */
+  /** @param {Float64Array} output of M's head: logits, means and logsigmas, (latents, mixtures) */
   constructor(output, latents, mixtures) {
     const size = latents * mixtures;
     this.latents = latents;
@@ -27,10 +28,10 @@ stad.Mixture = class {
    * Sample z: for each latent choose one Gaussian by its weight, then draw from it.
    * @param {number} temperature 1 as trained; below 1 narrower, above 1 wider
    * @param {{uniform: () => number, normal: () => number}} random
-   * @returns {Float32Array}
+   * @returns {Float64Array}
    */
   sample(temperature, random) {
-    const z = new Float32Array(this.latents);
+    const z = new Float64Array(this.latents);
     for (let i = 0; i < this.latents; i++) {
       const weights = this.weights(i, temperature);
       let rest = random.uniform();
@@ -44,7 +45,7 @@ stad.Mixture = class {
 
   /** Standard deviation of each latent's whole mixture: how uncertain M is about it. */
   standardDeviation() {
-    return Float32Array.from({ length: this.latents }, (_, i) => {
+    return Float64Array.from({ length: this.latents }, (_, i) => {
       const weights = this.weights(i);
       let [mean, square] = [0, 0];
       for (let k = 0, j = i * this.mixtures; k < this.mixtures; k++, j++) {
@@ -62,26 +63,27 @@ stad.MDNRNN = class {
     this.hiddenSize = tensors["lstm.weight_hh_l0"].shape[1];
     this.latentSize = tensors["lstm.weight_ih_l0"].shape[1] - 3; // beside the action
     this.mixtures = tensors["head.weight"].shape[0] / (3 * this.latentSize);
-    this.fromInput = stad.linear(tensors["lstm.weight_ih_l0"], tensors["lstm.bias_ih_l0"]);
-    this.fromHidden = stad.linear(tensors["lstm.weight_hh_l0"], tensors["lstm.bias_hh_l0"]);
-    this.head = stad.linear(tensors["head.weight"], tensors["head.bias"]);
+    const at = (weight, bias) => stad.linear(tensors[weight], tensors[bias], Float64Array);
+    this.fromInput = at("lstm.weight_ih_l0", "lstm.bias_ih_l0");
+    this.fromHidden = at("lstm.weight_hh_l0", "lstm.bias_hh_l0");
+    this.head = at("head.weight", "head.bias");
   }
 
   /** The memory at the start of an episode. */
   emptyState() {
-    return { h: new Float32Array(this.hiddenSize), c: new Float32Array(this.hiddenSize) };
+    return { h: new Float64Array(this.hiddenSize), c: new Float64Array(this.hiddenSize) };
   }
 
   /**
    * One step of the LSTM. The gates i, f, g and o decide what enters the memory c, what stays in
    * it, what the new content is, and what h shows of it.
-   * @param {Float32Array} z
-   * @param {Float32Array} action steering, gas and brake
-   * @param {{h: Float32Array, c: Float32Array}} state is not changed
+   * @param {ArrayLike<number>} z
+   * @param {ArrayLike<number>} action steering, gas and brake
+   * @param {{h: Float64Array, c: Float64Array}} state is not changed
    */
   remember(z, action, state) {
     const size = this.hiddenSize;
-    const input = new Float32Array(z.length + action.length);
+    const input = new Float64Array(z.length + action.length);
     input.set(z);
     input.set(action, z.length);
     const [x, y] = [this.fromInput(input), this.fromHidden(state.h)];
