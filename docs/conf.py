@@ -98,6 +98,7 @@ pygments_dark_style = "a11y-high-contrast-dark"
 WIDGET = "application/vnd.jupyter.widget-view+json"
 PROGRESS = "%|"  # of tqdm, beside the widget
 LIVE = {"00": "dream", "01": "speeds", "02": "latent", "03": "dream", "04": "evolution"}
+LIVE |= {"05": "index", "06": "index"}  # nothing there matches one of their widgets
 
 
 def explain_widgets(app, doctree) -> None:

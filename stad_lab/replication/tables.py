@@ -132,8 +132,8 @@ def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str
 
 def add_speed(file: Path, to: Path = DATA) -> None:
     """Add what `python -m stad_lab benchmark` wrote to the tables, in place of the same parts."""
-    result = load_json(file)
-    made_with, parts = result.pop("made_with"), result.keys() - {"rounds"}
+    result = load_json(file, kind="benchmark")
+    made_with, parts = result.pop("made_with"), result.keys() - {"kind", "rounds"}
     lines = []
     for part in parts:
         for measure, table in result[part].items():

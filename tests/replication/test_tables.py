@@ -74,7 +74,7 @@ def test_a_benchmark_takes_the_place_of_the_same_parts(tmp_path):
     for name in ("speed", "provenance"):
         shutil.copyfile(tables.DATA / f"{name}.csv", tmp_path / f"{name}.csv")
     row = {"median": 2.0, "rounds": [1.0, 2.0, 3.0], "ratio": 1.0}
-    result = {"made_with": {"commit": "c0ffee", "python": "3.11"}, "rounds": 3}
+    result = {"kind": "benchmark", "made_with": {"commit": "c0ffee", "python": "3.11"}, "rounds": 3}
     result |= {"loop": {"frames a second": {"one": row}, "costs": {"V": 5.5, "equal": True}}}
     save_json(tmp_path / "benchmark.json", result)
     before = tables.read("speed", tmp_path)
