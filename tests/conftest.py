@@ -109,9 +109,10 @@ def train_quickly(folder, guard):
     """Train with the quick preset under guard; returns what came of it."""
     guard.mkdir()
     (guard / "sitecustomize.py").write_text(GUARD)
-    compiled = Path(stad_lab.envs.__file__).parent / "__pycache__"  # where Numba keeps the engine
+    home = Path(stad_lab.__file__).parent  # here Numba keeps the engine
+    compiled = [str(folder / "__pycache__") for folder in (home, home / "envs")]
     # PyTorch looks for a place for temporary files in /dev/ and /proc/, too.
-    may_write = [str(folder), str(guard), str(compiled), "/dev/", "/proc/"]
+    may_write = [str(folder), str(guard), *compiled, "/dev/", "/proc/"]
     guarded = {
         "GUARDED": os.pathsep.join(may_write),
         "TMPDIR": str(guard),

@@ -122,6 +122,6 @@ def test_the_command_writes_every_measurement(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize(("parts", "rounds"), [(["speed"], 5), (["parity"], 0)])
 def test_an_unknown_part_or_no_round_is_refused(parts, rounds):
-    choice = "choose from parity, renderer, loop, training, with 1 round or more"
+    choice = "choose from parity, renderer, loop, training, run, with 1 round or more"
     with pytest.raises(ValueError, match=choice):
         benchmark(parts, rounds)

@@ -95,6 +95,7 @@ def main() -> None:
     config = Config.from_dict(load_json(folder / RECORD)["config"])
     world_model, log = load_world_model(folder), load_json(folder / LOG)
     controllers = np.array(mean_controllers(config, folder, world_model, log))[list(SHOWN)]
+    controllers = controllers.astype(np.float32).astype(float)  # as they are kept, for the paths
     tensors = {"controllers": controllers.astype(np.float32)}
     tensors |= dream_starts(world_model, controllers[-1])
     tracks = []

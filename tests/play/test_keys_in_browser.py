@@ -1,7 +1,7 @@
 """While a car drives, keys belong to the game wherever the pointer is: none edits the notebook."""
 
 import pytest
-from test_browser import SLOW, browser, lab, run, sees_another_picture, wait_for  # noqa: F401
+from test_browser import SLOW, lab, run, sees_another_picture, wait_for  # noqa: F401
 
 SEAT = """
 from stad_lab import load_agent
