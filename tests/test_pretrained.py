@@ -85,7 +85,9 @@ def test_a_shipped_log_holds_every_generation_and_the_best_mean(agent):
     assert record["budget"]["agents"] == evolution.generations * evolution.population
 
 
-@pytest.mark.parametrize("agent", AGENTS)
+@pytest.mark.parametrize(
+    "agent", [AGENTS[0], *(pytest.param(one, marks=pytest.mark.long) for one in AGENTS[1:])]
+)
 def test_a_shipped_agent_drives_as_in_its_evaluation(agent):
     episodes = load_evaluation(PRETRAINED / agent / "evaluation.json")["episodes"]
     shortest = min(episodes, key=lambda one: one["frames"])
