@@ -1,8 +1,8 @@
 """V's encoder and M's memory, compiled: what drives the cars, in every frame of every episode.
 
 `models` has the networks as students read them and as they are trained. Here the same arithmetic
-runs on the CPU without PyTorch, whose calls cost more than the arithmetic if the batch is small. An
-agent of one car is six times as fast, one of 16 cars half as fast again.
+runs on the CPU without PyTorch, whose calls cost more than the arithmetic if the batch is small: V
+takes a sixth of PyTorch's time for one car, and two thirds of it for 16.
 
 Everything is one operation, a layer: a patch of the input, times a matrix, plus a bias. For a
 convolution the patch is what lies below its kernel; for M it is z, the action and h side by side.
