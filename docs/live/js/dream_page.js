@@ -14,6 +14,7 @@ stad.start(async () => {
   let shown = null; // what V has decoded of the dream or of the drive
   let untouched = !stad.prefersStill(); // the first dream begins by itself
   let request = 0; // number of the last wish to close the eyes: a newer one replaces it
+  let waiting = false; // for M, to read the drive as far as a wish
   let [distances, spreads, parted] = [[], [], null];
   let others = []; // distances of earlier dreams from the same frame
   let [vae, mdnRnn, controller, memory] = [null, null, null, null];
@@ -105,15 +106,18 @@ stad.start(async () => {
     const over = dream && from + dream.frames >= drive.length;
     set("t", `${t}${over ? ", the recording has ended" : ""}`);
     set("dream-name", dream ? "The dream" : memory?.latents[t] ? "Reconstruction" : "Seen");
-    set("dream-note", dream ? `frame ${dream.frames}, ${wheel}` : "The eyes are open.");
-    set("eyes", dream ? "Open the eyes" : "Close the eyes here");
+    const open = waiting ? "M is reading the drive up to this frame." : "The eyes are open.";
+    set("dream-note", dream ? `frame ${dream.frames}, ${wheel}` : open);
+    set("eyes", dream ? "Open the eyes" : waiting ? "Keep them open" : "Close the eyes here");
     set("scrub-value", String(t));
     set(
       "parted",
       parted !== null
         ? `They parted after ${parted} frames (${(parted / 50).toFixed(1)} s).`
         : dream
-          ? "They have not parted yet."
+          ? over
+            ? "The recording ended before they had parted."
+            : "They have not parted yet."
           : "Close the eyes to see the curve.",
     );
     get("scrub").value = t;
@@ -145,12 +149,14 @@ stad.start(async () => {
   async function closeEyes(start = t) {
     const wish = ++request;
     if (!memory || memory.length <= start) {
-      get("dream-note").textContent = "M is reading the drive up to this frame.";
-      clock.pause();
+      waiting = true;
+      setPlaying(false);
+      draw();
       while (!memory || memory.length <= start) {
         await new Promise((done) => setTimeout(done, 20));
         if (wish !== request) return;
       }
+      waiting = false;
     }
     others = start === from ? [...others, distances].slice(-8) : [];
     [t, from] = [start, start];
@@ -169,11 +175,17 @@ stad.start(async () => {
   }
 
   function openEyes() {
-    request++;
+    cancelWish();
     dream = null;
-    stad.announce(`The eyes are open at frame ${t}.`);
     if (t >= drive.length - 1) t = BEGIN;
+    stad.announce(`The eyes are open at frame ${t}.`);
     draw();
+  }
+
+  /** Forget a wish to close the eyes for which M is still reading. */
+  function cancelWish() {
+    request++;
+    waiting = false;
   }
 
   function setPlaying(playing) {
@@ -220,12 +232,13 @@ stad.start(async () => {
     act(event);
   };
   const toggleEyes = touched((event) => {
-    if (dream) return openEyes();
+    if (dream || waiting) return openEyes();
     closeEyes();
     if (event.detail > 0) sit(); // a click; who uses the keyboard keeps the focus
   });
   const sit = () => get("seat").focus({ preventScroll: true });
   const togglePlay = touched(() => {
+    cancelWish();
     if (!clock.running && dream?.frames >= LONGEST) openEyes();
     setPlaying(!clock.running);
   });
@@ -233,7 +246,10 @@ stad.start(async () => {
   get("play").addEventListener("click", togglePlay);
   get("again").addEventListener(
     "click",
-    touched(() => closeEyes(from)),
+    touched((event) => {
+      closeEyes(from);
+      if (event.detail > 0) sit(); // so that the arrow keys steer
+    }),
   );
   get("driver").addEventListener(
     "change",
@@ -242,7 +258,7 @@ stad.start(async () => {
   get("scrub").addEventListener(
     "input",
     touched(({ target }) => {
-      request++;
+      cancelWish();
       [dream, t] = [null, Number(target.value)];
       setPlaying(false);
       draw();
@@ -267,7 +283,8 @@ stad.start(async () => {
   const take = touched(() => {
     if (driver !== "hand" || !dream) setDriver("hand");
   });
-  const drives = () => driver === "hand" && dream && clock.running;
+  const drives = () =>
+    dream && clock.running && (driver === "hand" || get("live").contains(document.activeElement));
   stad.listenToPedals(hand, get("seat"), take, drives);
   addEventListener("gamepadconnected", ({ gamepad }) => {
     get("gamepad").textContent =

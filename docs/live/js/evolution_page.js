@@ -203,7 +203,7 @@ stad.start(async () => {
   const setDream = (on) => {
     if (on) clock.play();
     else clock.pause();
-    stad.get("dream-play").textContent = on ? "Pause" : "Drive";
+    stad.get("dream-play").textContent = on ? "Pause the car and the dream" : "Drive";
   };
 
   slider.max = last;
@@ -219,6 +219,7 @@ stad.start(async () => {
   stad.get("play").addEventListener("click", () => {
     if (timer) return stop();
     stad.get("play").textContent = "Pause";
+    setDream(!stad.prefersStill());
     if (chosen === last) choose(0);
     timer = setInterval(() => (chosen === last ? stop() : choose(chosen + 1)), 2500);
   });

@@ -249,6 +249,8 @@ stad.start(async () => {
     ["up", 1],
   ])
     get(id).addEventListener("change", ({ target }) => {
+      const other = get(id === "up" ? "across" : "up");
+      if (target.value === other.value) other.value = axes[1 - place] = axes[place]; // they swap
       axes[place] = Number(target.value);
       show();
       renewMap();

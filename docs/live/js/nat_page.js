@@ -91,7 +91,9 @@ stad.start(async () => {
     stad.get("weight").value = chosen;
     stad.get("weight").setAttribute("aria-valuetext", String(one.kl_weight));
     stad.get("weight-value").textContent = one.kl_weight;
-    [stad.get("less").disabled, stad.get("more").disabled] = [chosen === 0, chosen === last];
+    // Not `disabled`: the button would lose the focus of who uses the keyboard.
+    stad.get("less").setAttribute("aria-disabled", chosen === 0);
+    stad.get("more").setAttribute("aria-disabled", chosen === last);
     canvases.forEach((line, number) =>
       line.forEach((canvas, frame) => {
         const { name, row, original } = rows[number];
