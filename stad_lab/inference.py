@@ -147,7 +147,7 @@ def run_layer(x: np.ndarray, layer: Layer, y: np.ndarray) -> None:
 
 @compiled
 def run_encoder(frames, earlier, pictures, layers, first, second):
-    """Encode frames into `second`; `pictures`, `first` and `second` are memory to work in."""
+    """The last layer's outputs; `pictures`, `first` and `second` are memory to work in."""
     channels = pictures.shape[-1]
     for car in range(len(frames)):
         for row in range(FRAME_SIZE):
@@ -162,6 +162,7 @@ def run_encoder(frames, earlier, pictures, layers, first, second):
     for layer in layers:
         run_layer(x, layer, y)
         x, y, other = y, other, y
+    return x
 
 
 @compiled(error_model="numpy")
@@ -199,9 +200,10 @@ class Inference:
             earlier: the frames that are subtracted from these for the difference images.
         """
         self._prepare(len(frames))
-        run_encoder(frames, earlier, self._pictures, self._layers, self._first, self._second)
+        memory = self._first, self._second
+        encoded = run_encoder(frames, earlier, self._pictures, self._layers, *memory)
         width = len(self._layers[-1].bias)
-        latents = self._first[: len(frames) * width].reshape(-1, width)  # of five layers
+        latents = encoded[: len(frames) * width].reshape(-1, width)
         return latents[:, : self.latent_size].copy()
 
     def remember(self, latents: np.ndarray, actions: np.ndarray, state: np.ndarray) -> np.ndarray:

@@ -27,16 +27,10 @@ stad.Chart = class {
   }
 
   draw() {
-    const { canvas, axes } = this;
-    const ratio = devicePixelRatio || 1;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    if (!width || !height) return; // folded away
-    if (canvas.width !== Math.round(width * ratio)) canvas.width = Math.round(width * ratio);
-    if (canvas.height !== Math.round(height * ratio)) canvas.height = Math.round(height * ratio);
-    const context = canvas.getContext("2d");
-    context.setTransform(ratio, 0, 0, ratio, 0, 0);
-    context.clearRect(0, 0, width, height);
-    context.font = "12px system-ui, sans-serif";
+    const { axes } = this;
+    const cleared = stad.clearCanvas(this.canvas);
+    if (!cleared) return; // folded away
+    const { context, width, height } = cleared;
     const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(
       stad.color,
     );

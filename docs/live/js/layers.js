@@ -43,6 +43,17 @@ stad.relu = (x) => {
   return x;
 };
 
+/** Weights of shape (outer, inner, kernel, kernel) as (outer, kernel, kernel, inner). */
+stad.channelsLast = (data, outer, inner, kernel) => {
+  const area = kernel * kernel;
+  const found = new Float32Array(data.length);
+  for (let o = 0; o < outer; o++)
+    for (let i = 0; i < inner; i++)
+      for (let k = 0; k < area; k++)
+        found[(o * area + k) * inner + i] = data[(o * inner + i) * area + k];
+  return found;
+};
+
 /**
  * A convolution of stride 2 without padding, as torch.nn.Conv2d.
  * @param {{shape: number[], data: Float32Array}} weight of shape (outputs, inputs, kernel, kernel)
@@ -51,13 +62,7 @@ stad.relu = (x) => {
  */
 stad.convolution = ({ shape: [outputs, inputs, kernel], data }, { data: bias }) => {
   const run = kernel * inputs; // a row of the kernel: neighbours in x, and so in the weights
-  const weight = new Float32Array(data.length); // (outputs, kernel, kernel, inputs)
-  for (let o = 0; o < outputs; o++)
-    for (let i = 0; i < inputs; i++)
-      for (let k = 0; k < kernel * kernel; k++)
-        weight[(o * kernel * kernel + k) * inputs + i] =
-          data[(o * inputs + i) * kernel * kernel + k];
-
+  const weight = stad.channelsLast(data, outputs, inputs, kernel);
   const dot = stad.dotRows(weight, run, kernel);
   return (x, size) => {
     const side = Math.floor((size - kernel) / 2) + 1;
@@ -97,12 +102,7 @@ stad.dotRows = (weight, run, rows) => (x, corner, line, start) => {
  */
 stad.transposedConvolution = ({ shape: [inputs, outputs, kernel], data }, { data: bias }) => {
   const run = kernel * outputs;
-  const weight = new Float32Array(data.length); // (inputs, kernel, kernel, outputs)
-  for (let i = 0; i < inputs; i++)
-    for (let o = 0; o < outputs; o++)
-      for (let k = 0; k < kernel * kernel; k++)
-        weight[(i * kernel * kernel + k) * outputs + o] =
-          data[(i * outputs + o) * kernel * kernel + k];
+  const weight = stad.channelsLast(data, inputs, outputs, kernel);
 
   return (x, size) => {
     const side = 2 * (size - 1) + kernel;
