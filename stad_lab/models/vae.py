@@ -56,7 +56,7 @@ class VAE(nn.Module):
         self.decoder = nn.Sequential(
             nn.Linear(latent_size, 32 * width),
             nn.Unflatten(1, (32 * width, 1, 1)),
-            nn.ConvTranspose2d(32 * width, 4 * width, 5, stride=2),  # 1 -> 5 pixels
+            PixelDeconvolution(32 * width, 4 * width, 5),  # 1 -> 5 pixels
             nn.ReLU(inplace=True),
             nn.ConvTranspose2d(4 * width, 2 * width, 5, stride=2),  # 5 -> 13
             nn.ReLU(inplace=True),
@@ -75,15 +75,32 @@ class VAE(nn.Module):
 
     def decode(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
         """z (batch, latent_size) -> the frame, and the difference image or None."""
-        decoded = self.decoder(z)
-        frame = torch.sigmoid(decoded[:, :3])
-        return frame, torch.tanh(decoded[:, 3:]) if self.reconstructs_difference else None
+        frame, *difference = self.decoder(z).split(3, dim=1)
+        # Copies: sigmoid and tanh are several times slower on a part of an array.
+        frame = torch.sigmoid(frame.contiguous(memory_format=torch.channels_last))
+        if not difference:
+            return frame, None
+        return frame, torch.tanh(difference[0].contiguous(memory_format=torch.channels_last))
 
     def reconstruct(
         self, frame: torch.Tensor, difference: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Encode and decode through the mean mu, without sampling."""
         return self.decode(self.encode(frame, difference)[0])
+
+
+class PixelDeconvolution(nn.ConvTranspose2d):
+    """The transposed convolution of a single pixel, computed as the matrix product that it is.
+
+    (batch, channels, 1, 1) -> (batch, out_channels, k, k), in a third of the time.
+    """
+
+    def forward(self, pixel: torch.Tensor) -> torch.Tensor:
+        """Each place of the k x k pixels has its own linear layer."""
+        weights = self.weight.permute(0, 2, 3, 1)  # channels, row, column, out_channels
+        bias = self.bias.repeat(self.kernel_size[0] * self.kernel_size[1])
+        made = torch.addmm(bias, pixel.flatten(1), weights.reshape(len(weights), -1))
+        return made.view(-1, *weights.shape[1:]).permute(0, 3, 1, 2)
 
 
 def soft_bound(value: torch.Tensor, low: float, high: float) -> torch.Tensor:
