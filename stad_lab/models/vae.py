@@ -62,7 +62,7 @@ class VAE(nn.Module):
             nn.ReLU(inplace=True),
             nn.ConvTranspose2d(2 * width, width, 6, stride=2),  # 13 -> 30
             nn.ReLU(inplace=True),
-            nn.ConvTranspose2d(width, 6 if self.reconstructs_difference else 3, 6, stride=2),  # 64
+            ColourDeconvolution(width, 6 if self.reconstructs_difference else 3, 6, stride=2),  # 64
         )
 
     def encode(
@@ -87,6 +87,41 @@ class VAE(nn.Module):
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
         """Encode and decode through the mean mu, without sampling."""
         return self.decode(self.encode(frame, difference)[0])
+
+
+class ColourDeconvolution(nn.ConvTranspose2d):
+    """A transposed convolution to few channels, with stride 2: in half the time forward."""
+
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+        """(batch, channels, n, n) -> (batch, out_channels, 2 n + 4, 2 n + 4)."""
+        return Interleave.apply(pictures, self.weight, self.bias)
+
+
+class Interleave(torch.autograd.Function):
+    """Computes `ColourDeconvolution`: forward as a convolution, backward as PyTorch does.
+
+    The outputs in rows and columns of one parity are an ordinary convolution of the input. So one
+    convolution with four times the channels computes all of them, and fills a processor's registers
+    where three or six channels do not.
+    """
+
+    @staticmethod
+    def forward(ctx, pictures, weight, bias):
+        """One convolution, whose channels become the four parities of the pixels."""
+        ctx.save_for_backward(pictures, weight)
+        channels, made = weight.shape[:2]
+        parts = weight.reshape(channels, made, 3, 2, 3, 2)  # row, its parity, column, its parity
+        parts = parts.flip(2, 4).permute(1, 3, 5, 0, 2, 4).reshape(4 * made, channels, 3, 3)
+        convolved = nn.functional.conv2d(pictures, parts, bias.repeat_interleave(4), padding=2)
+        return nn.functional.pixel_shuffle(convolved, 2)
+
+    @staticmethod
+    def backward(ctx, gradient):
+        """Gradients of the pictures, the weight and the bias."""
+        made, no = gradient.shape[1], [0, 0]
+        return torch.ops.aten.convolution_backward(
+            gradient, *ctx.saved_tensors, [made], [2, 2], no, [1, 1], True, no, 1, [True] * 3
+        )
 
 
 class PixelDeconvolution(nn.ConvTranspose2d):

@@ -7,6 +7,7 @@ on the CPU with as many threads, and nearly so on a GPU.
 
 import contextlib
 import ctypes
+import functools
 import math
 import sys
 from collections import Counter
@@ -26,8 +27,7 @@ from stad_lab.io.files import load_into, load_tensors, save_tensors
 ENTRIES = 20  # of the history, and checkpoints, in a training
 LARGEST_NORM = 100.0  # of the gradient, which is shortened to it
 LAST_RATE = 0.1  # learning rate at the end, as a share of that at the start
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # parameters of glibc's mallopt
-KEPT_BYTES = 2**30  # of freed memory, at most
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # parameters of glibc's mallopt
 
 
 @dataclass
@@ -78,6 +78,7 @@ def fit(training: Training) -> list[dict]:
                 sums.clear()
                 progress.set_postfix(heldout=f"{history[-1]['heldout']['total']:.4g}")
                 save_state(training, optimizer, history)
+                return_freed_memory()
                 if training.watch:
                     training.watch(history)
     except KeyboardInterrupt:
@@ -92,10 +93,23 @@ def keep_freed_memory() -> None:
     Otherwise the system takes it back and clears it, a tenth of the time of a step. Only glibc,
     the C library of most Linux systems, can be told.
     """
-    with contextlib.suppress(OSError, AttributeError):
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-        for threshold in (M_TRIM_THRESHOLD, M_MMAP_THRESHOLD):
-            mallopt(threshold, KEPT_BYTES)
+    if library := c_library():
+        library.mallopt(M_MMAP_MAX, 0)
+        library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
+
+
+def return_freed_memory() -> None:
+    """Give it back after all, now and then: in time it is cut into pieces, and more is needed."""
+    if library := c_library():
+        library.malloc_trim(0)
+
+
+@functools.cache
+def c_library() -> ctypes.CDLL | None:
+    """glibc, or None on a system with another C library."""
+    with contextlib.suppress(OSError):
+        return ctypes.CDLL("libc.so.6")
+    return None
 
 
 def entry(training: Training, step: int, history: list[dict], sums: dict[str, float]) -> dict:

@@ -5,6 +5,7 @@ import typing
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
 from stad_lab.config import VARIANTS, Config
 from stad_lab.envs.frames import to_pictures
@@ -12,6 +13,8 @@ from stad_lab.io.weights import load_vae, save_vae
 from stad_lab.models import vae as models_vae
 from stad_lab.models.vae import (
     VAE,
+    ColourDeconvolution,
+    PixelDeconvolution,
     soft_bound,
     to_array,
     to_tensor,
@@ -213,3 +216,21 @@ def test_weights_that_are_not_finite_are_refused(tmp_path):
     message = r"v.safetensors holds values that are not finite in 'encoder.0.bias': train it again"
     with pytest.raises(ValueError, match=message):
         load_vae(tmp_path / "v.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("ours", "sizes", "pixels"),
+    [(PixelDeconvolution, (64, 8, 5), 1), (ColourDeconvolution, (16, 6, 6), 30)],
+)
+def test_a_faster_deconvolution_equals_that_of_pytorch_and_so_do_its_gradients(ours, sizes, pixels):
+    fast, plain = ours(*sizes, stride=2), nn.ConvTranspose2d(*sizes, stride=2)
+    plain.load_state_dict(fast.state_dict())
+    pictures = torch.randn(3, sizes[0], pixels, pixels)
+    found = []
+    for layer in (fast, plain):
+        seen = pictures.clone().requires_grad_()
+        made = layer(seen)
+        (made**2).sum().backward()
+        found.append([made, seen.grad, layer.weight.grad, layer.bias.grad])
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-3)
