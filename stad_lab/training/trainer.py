@@ -6,8 +6,6 @@ on the CPU with as many threads, and nearly so on a GPU.
 """
 
 import contextlib
-import ctypes
-import functools
 import math
 import sys
 from collections import Counter
@@ -23,11 +21,11 @@ from tqdm.auto import tqdm
 
 from stad_lab.config import check_same, random_stream
 from stad_lab.io.files import load_into, load_tensors, save_tensors
+from stad_lab.io.memory import keep_freed_memory, return_freed_memory
 
 ENTRIES = 20  # of the history, and checkpoints, in a training
 LARGEST_NORM = 100.0  # of the gradient, which is shortened to it
 LAST_RATE = 0.1  # learning rate at the end, as a share of that at the start
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # parameters of glibc's mallopt
 
 
 @dataclass
@@ -85,31 +83,6 @@ def fit(training: Training) -> list[dict]:
         print(f"{training.label}: interrupted in step {step}; the same call continues")
         raise
     return history
-
-
-def keep_freed_memory() -> None:
-    """Let the C library keep what a training step frees, because the next one needs it again.
-
-    Otherwise the system takes it back and clears it, a tenth of the time of a step. Only glibc,
-    the C library of most Linux systems, can be told.
-    """
-    if library := c_library():
-        library.mallopt(M_MMAP_MAX, 0)
-        library.mallopt(M_TRIM_THRESHOLD, 2**31 - 1)
-
-
-def return_freed_memory() -> None:
-    """Give it back after all, now and then: in time it is cut into pieces, and more is needed."""
-    if library := c_library():
-        library.malloc_trim(0)
-
-
-@functools.cache
-def c_library() -> ctypes.CDLL | None:
-    """glibc, or None on a system with another C library."""
-    with contextlib.suppress(OSError):
-        return ctypes.CDLL("libc.so.6")
-    return None
 
 
 def entry(training: Training, step: int, history: list[dict], sums: dict[str, float]) -> dict:
