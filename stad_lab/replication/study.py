@@ -8,8 +8,8 @@ folder of a study::
     seed0/frame/z/              C that sees z, with the log of CMA-ES and the episodes of the score
     networks/seed0/frame/...    what is kept of them, see `stad_lab.replication.networks`
 
-Whatever is there is not done again. A pipeline that is in the tables is not run, unless it is asked
-for by its name: then it is compared with what the tables say.
+Whatever is there is not done again. A variant of a seed whose pipelines are in the tables is not
+run, unless one is asked for by its name: then it is compared with what the tables say.
 """
 
 import contextlib
@@ -144,7 +144,7 @@ def run_study(
     wanted, root = find_pipelines(study, seeds, only), Path(folder) / study
     for seed in dict.fromkeys(pipeline.seed for pipeline in wanted):
         own = [one for one in wanted if one.seed == seed]
-        missing = [one for one in own if only or recorded(one, to) is None]
+        missing = own if only else unfinished(own, to)
         with contextlib.ExitStack() as stack:
             try:
                 if missing:
@@ -154,19 +154,24 @@ def run_study(
                 continue
             for pipeline in missing:
                 print(f"{pipeline.name}: {describe_progress(study, wanted, to)}", flush=True)
-                found = finish(pipeline, root, executor, to)
+                run_pipeline(pipeline, root, executor)
+                if only and recorded(pipeline, to):
+                    found = compare(pipeline, root, to)
+                else:
+                    add_pipeline(pipeline, root, to)
+                    found = describe_score(pipeline, root)
                 print(f"{pipeline.name}: {found}", flush=True)
     print(f"{study}: {describe_progress(study, wanted, to)}")
 
 
-def finish(pipeline: Pipeline, root: Path, executor: Executor | None, to: Path) -> str:
-    """Run a pipeline, and add it to the tables or compare it with them; returns what was found."""
-    known = recorded(pipeline, to)
-    run_pipeline(pipeline, root, executor)
-    if known:
-        return compare(pipeline, root, to)
-    add_pipeline(pipeline, root, to)
-    return describe_score(pipeline, root)
+def unfinished(pipelines: list[Pipeline], to: Path) -> list[Pipeline]:
+    """Those of a seed that are to be run: of a variant all, if one is not in the tables.
+
+    They share V and M, which come out otherwise on another kind of processor. Those whose score is
+    in the folder are only added again.
+    """
+    lacking = {one.variant for one in pipelines if recorded(one, to) is None}
+    return [one for one in pipelines if one.variant in lacking]
 
 
 def run_pipeline(pipeline: Pipeline, root: Path, executor: Executor | None) -> None:

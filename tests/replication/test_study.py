@@ -152,6 +152,19 @@ def test_what_is_in_the_tables_is_not_run_and_what_is_in_the_folder_is_added(
         assert (tmp_path / "data" / file).read_bytes() == (made / "data" / file).read_bytes()
 
 
+def test_a_variant_that_lacks_a_pipeline_is_added_as_a_whole_because_both_share_v_and_m(
+    made, tmp_path
+):
+    shutil.copytree(made / "data", tmp_path / "data")
+    runs = tables.read_study("runs", tmp_path / "data")
+    runs.loc[runs.variant == "frame", "kept_world_model"] = "of another processor"
+    lacks = (runs.variant == "frame") & (runs.features == "z, h")
+    tables.save("study_runs", runs[~lacks], tmp_path / "data")
+    run_study("tiny", made, seeds=[0], to=tmp_path / "data")
+    file = "study_runs.csv"
+    assert (tmp_path / "data" / file).read_bytes() == (made / "data" / file).read_bytes()
+
+
 def test_a_pipeline_repeated_by_name_is_bit_identical(made, tmp_path, capsys, monkeypatch):
     for name in ("replace_lines", "add_run"):
         monkeypatch.setattr(tables, name, lambda *given: pytest.fail("it changed the tables"))
