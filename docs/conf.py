@@ -5,6 +5,7 @@ on a code host. Their outputs are cached: only a changed notebook, library or pr
 again. Neither the build nor the pages need a network.
 """
 
+import gc
 import hashlib
 import os
 import re
@@ -16,6 +17,8 @@ from sphinx import addnodes
 from sphinx.util import logging
 
 from stad_lab.config import PRESET_VARIABLE
+
+gc.set_threshold(100_000)  # Sphinx keeps what it makes: it looks for garbage a sixth of the time
 
 HERE = Path(__file__).parent
 PACKAGE = HERE.parent / "stad_lab"
