@@ -1,7 +1,8 @@
 """CarRacing-v3 as a Gymnasium environment on our engine, for one car.
 
 Returns, rewards and endings are those of Gymnasium's own CarRacing-v3, bit for bit; the observation
-differs by less than 0.3 of 255 on average. To drive many cars at once, see `envs.vector`.
+differs by less than 0.3 of 255 on average, in the usual colours. To drive many cars at once, see
+`envs.vector`.
 """
 
 import inspect
@@ -138,9 +139,7 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
             ValueError: an action that is not three finite numbers, or not one of the five.
             RuntimeError: called before `reset`, or after `close`.
         """
-        self._check_open()
-        if not self._started:
-            raise RuntimeError("step before reset: call reset() to begin an episode")
+        self._check_begun("step")
         rewards, ended = self.cars.step(np.asarray(action)[None])
         ending = self.cars.cars["ending"][0]
         info = {"lap_finished": bool(ending == physics.LAP_FINISHED)} if ended[0] else {}
@@ -150,21 +149,24 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
     @property
     def track(self) -> np.ndarray:
         """The centre line, float64 (tiles, 4): angle from the origin, heading, x and y."""
+        self._check_begun("track")
         return self.cars.tracks[0].path
 
     @property
     def position(self) -> np.ndarray:
         """Where the hull is, world units, float64 (2,)."""
+        self._check_begun("position")
         return self.cars.cars["position"][0, 0].astype(float)
 
     def place(self, tile: int, *how: float, **named: float) -> np.ndarray:
         """Put the car on a tile, as `Cars.place`; returns the observation there."""
+        self._check_begun("place")
         self.cars.place(0, tile, *how, **named)
         return self.cars.draw()[0]
 
     def render(self) -> np.ndarray | None:
         """Gymnasium's window: uint8 (400, 600, 3) for "rgb_array"; None for "human"."""
-        self._check_open()
+        self._check_begun("render")
         if self.render_mode is None:
             gym.logger.warn("render() without a render_mode: give one to make(...)")
             return None
@@ -181,6 +183,11 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
     def _show(self) -> None:
         if self.render_mode == "human":
             self.render()
+
+    def _check_begun(self, what: str) -> None:
+        self._check_open()
+        if not self._started:  # a copy begins like a new environment
+            raise RuntimeError(f"{what} before reset: call reset() to begin an episode")
 
     def _check_open(self) -> None:
         if self.cars is None:

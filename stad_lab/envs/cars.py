@@ -37,6 +37,9 @@ class Cars:
         lap_complete_percent: as in Gymnasium, from 0 to 1.
         domain_randomize: whether each episode has its own random colours.
 
+    Raises:
+        ValueError: another share of a lap.
+
     Attributes:
         cars: `physics.CAR` (count,), the state of each car; see there.
         roads: `physics.ROAD` (count,), the tiles of each track, and which were visited.
@@ -55,13 +58,16 @@ class Cars:
         lap_complete_percent: float = 0.95,
         domain_randomize: bool = False,
     ):
+        if not 0 <= lap_complete_percent <= 1:
+            raise ValueError(f"lap_complete_percent={lap_complete_percent}: expected 0 to 1")
         warm_up()
         self.shows, self.bar, self.continuous = shows, bar, continuous
         self.lap_complete_percent = float(lap_complete_percent)
         self.domain_randomize = domain_randomize
         self.cars, self.roads = np.zeros(count, physics.CAR), np.zeros(count, physics.ROAD)
         self.tracks: list[Track | None] = [None] * count
-        self.randoms = [seeding.np_random()[0] for _ in range(count)]
+        randoms = [seeding.np_random() for _ in range(count)]
+        self.randoms, self.seeds = map(list, zip(*randoms, strict=True))
         self.colors = {
             name: np.tile(np.array(one, float), (count, 1)) for name, one in COLORS.items()
         }
@@ -91,7 +97,7 @@ class Cars:
         seeds = [None] * len(which) if seeds is None else seeds
         for car, seed in zip(which, seeds, strict=True):
             if seed is not None:
-                self.randoms[car] = seeding.np_random(int(seed))[0]
+                self.randoms[car], self.seeds[car] = seeding.np_random(int(seed))
             if self.domain_randomize and randomize:
                 self._draw_colors(car)
             track = self.tracks[car] = make_track(self.randoms[car])
@@ -146,7 +152,16 @@ class Cars:
             speed: forward, world units per second (a calm lap has about 40).
             turn: heading against the road's direction, radians, positive to the left.
             offset: from the centre line, in half road widths, positive to the right.
+
+        Raises:
+            ValueError: a tile that is not a whole number, or another number that is not finite.
         """
+        whole = isinstance(tile, int | np.integer)
+        if not whole or not np.isfinite([speed, turn, offset]).all():
+            raise ValueError(
+                f"tile={tile!r}, speed={speed}, turn={turn}, offset={offset}: expected a whole"
+                " number and three finite ones"
+            )
         pose = pose_on(self.tracks[car].path, tile, turn, offset)
         physics.place_car(self.cars, car, *pose, float(speed))
 

@@ -27,10 +27,10 @@ class CarRacingVector(gym.vector.VectorEnv):
     Args:
         num_envs: number of cars.
         max_episode_steps: frames after which an episode is truncated.
-        autoreset_mode: NEXT_STEP (Gymnasium's default): the step after an episode's end begins a
-            new one and ignores the action. SAME_STEP: the new episode begins at once, and `info`
-            has "final_obs" and "final_info". DISABLED: the caller resets with
-            `options={"reset_mask": ...}`.
+        autoreset_mode: one of Gymnasium's `AutoresetMode`, or its value such as "NextStep".
+            NEXT_STEP, the default: the step after an episode's end begins a new one and ignores
+            the action. SAME_STEP: the new episode begins at once, and `info` has "final_obs" and
+            "final_info". DISABLED: the caller resets with `options={"reset_mask": ...}`.
         bar: whether to draw the indicator bar.
         render_mode: None; a batch has no window.
         continuous, lap_complete_percent, domain_randomize: as Gymnasium's.
@@ -84,11 +84,13 @@ class CarRacingVector(gym.vector.VectorEnv):
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
             raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), one at least")
+        if not self._begun and not mask.all():
+            raise ValueError(f"reset_mask={mask}: the first reset is of all cars, leave it out")
         if seed is None or isinstance(seed, int | np.integer):
             seed = [None if seed is None else seed + car for car in range(self.num_envs)]
-        whole = [one is None or isinstance(one, int | np.integer) for one in seed]
+        whole = [one is None or (isinstance(one, int | np.integer) and one >= 0) for one in seed]
         if len(whole) != self.num_envs or not all(whole):
-            raise ValueError(f"seed={seed!r}: expected {self.num_envs} whole numbers or one")
+            raise ValueError(f"seed={seed!r}: expected {self.num_envs} numbers 0, 1, ..., or one")
         which = np.flatnonzero(mask)
         self.cars.reset([seed[car] for car in which], which, options.get("randomize", True))
         self._ended[which], self._begun = False, True
@@ -124,6 +126,18 @@ class CarRacingVector(gym.vector.VectorEnv):
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             info = self._begin_again(observations, info)
         return observations, rewards, terminated, truncated, info
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:
+        """The random numbers of each car, as `SyncVectorEnv` gives them."""
+        self._check_open()
+        return tuple(self.cars.randoms)
+
+    @property
+    def np_random_seed(self) -> tuple[int, ...]:
+        """The last seed of each car."""
+        self._check_open()
+        return tuple(self.cars.seeds)
 
     def close_extras(self, **kwargs) -> None:
         """Release the memory of the tracks."""

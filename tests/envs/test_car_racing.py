@@ -202,14 +202,33 @@ def test_an_action_that_is_not_three_finite_numbers_is_refused(action):
         env.unwrapped.step(np.array(action))
 
 
-def test_a_step_before_the_reset_or_after_close_is_refused():
+@pytest.mark.parametrize("share", [95, -0.1, np.nan])
+def test_a_share_of_a_lap_that_is_none_is_refused(share):
+    with pytest.raises(ValueError, match=f"lap_complete_percent={share}: expected 0 to 1"):
+        make_env(lap_complete_percent=share)
+
+
+@pytest.mark.parametrize("how", [{"tile": 2.5}, {"tile": 3, "speed": np.nan}])
+def test_a_place_that_is_no_number_is_refused_and_the_car_stays(how):
     env = make_env().unwrapped
-    with pytest.raises(RuntimeError, match=r"^step before reset: call reset\(\) to begin"):
-        env.step(GAS)
+    env.reset(seed=0)
+    before = env.cars.cars.copy()
+    with pytest.raises(ValueError, match="expected a whole number and three finite ones"):
+        env.place(**how)
+    assert np.array_equal(before, env.cars.cars)
+
+
+def test_a_step_before_the_reset_or_after_close_is_refused():
+    env = make_env(render_mode="rgb_array").unwrapped
+    uses = {"step": lambda: env.step(GAS), "render": env.render, "place": lambda: env.place(3)}
+    uses |= {name: lambda name=name: getattr(env, name) for name in ("track", "position")}
+    for name, use in uses.items():
+        with pytest.raises(RuntimeError, match=rf"^{name} before reset: call reset\(\) to begin"):
+            use()
     env.reset(seed=0)
     env.close()
     env.close()
-    for call in (lambda: env.step(GAS), env.reset, env.render):
+    for call in (env.reset, *uses.values()):
         with pytest.raises(RuntimeError, match=r"^the environment is closed: make a new one$"):
             call()
 

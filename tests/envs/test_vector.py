@@ -97,15 +97,27 @@ def test_a_mask_of_no_car_of_another_shape_or_of_numbers_is_refused(mask):
         envs.reset(options={"reset_mask": np.array(mask)})
 
 
+def test_the_first_reset_is_of_all_cars():
+    envs = CarRacingVector(CARS)
+    with pytest.raises(ValueError, match="the first reset is of all cars"):
+        envs.reset(options={"reset_mask": np.array([True, False, False])})
+    with pytest.raises(ResetNeeded):
+        envs.step(np.zeros((CARS, 3), np.float32))
+
+
 def test_seeds_count_up_from_one_number_or_are_given_for_each_car():
     envs = CarRacingVector(CARS)
     one, several = envs.reset(seed=4)[0], envs.reset(seed=[4, 5, 6])[0]
     assert np.array_equal(one, several)
     assert np.array_equal(one[2], make_env().reset(seed=6)[0])
     assert not np.array_equal(envs.reset()[0], one)
-    for seeds in ([1, 2], "abc", [1, 2, "3"]):
-        with pytest.raises(ValueError, match="expected 3 whole numbers or one"):
+    assert envs.reset(seed=[7, None, 9]) and envs.np_random_seed[::2] == (7, 9)
+    before = [state.bit_generator.state for state in envs.np_random], envs.cars.cars.copy()
+    for seeds in ([1, 2], "abc", [1, 2, "3"], [1, 2, -1], -1):
+        with pytest.raises(ValueError, match=r"expected 3 numbers 0, 1, \.\.\., or one"):
             envs.reset(seed=seeds)
+    assert before[0] == [state.bit_generator.state for state in envs.np_random]
+    assert np.array_equal(before[1], envs.cars.cars)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
