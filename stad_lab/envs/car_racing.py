@@ -126,7 +126,7 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         """
         self._check_open()
         super().reset(seed=seed)
-        self.cars.randoms[0] = self.np_random
+        self.cars.randoms[0], self.cars.seeds[0] = self.np_random, self.np_random_seed
         self.cars.reset(randomize=(options or {}).get("randomize", True))
         self._started = True
         self._show()

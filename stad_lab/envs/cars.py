@@ -44,7 +44,8 @@ class Cars:
         cars: `physics.CAR` (count,), the state of each car; see there.
         roads: `physics.ROAD` (count,), the tiles of each track, and which were visited.
         tracks: the Track of each car.
-        randoms: the random generator of each car, Gymnasium's `np_random`.
+        randoms, seeds: the random generator of each car and its seed, Gymnasium's `np_random` and
+            `np_random_seed`.
         ground: the painted tracks, a `picture.Ground`; None before the first `draw`.
         colors: "road", "background" and "grass", float64 (count, 3), 0 to 255.
     """

@@ -75,12 +75,11 @@ class VAE(nn.Module):
 
     def decode(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
         """z (batch, latent_size) -> the frame, and the difference image or None."""
-        frame, *difference = self.decoder(z).split(3, dim=1)
+        parts = self.decoder(z).split(3, dim=1)
         # Copies: sigmoid and tanh are several times slower on a part of an array.
-        frame = torch.sigmoid(frame.contiguous(memory_format=torch.channels_last))
-        if not difference:
-            return frame, None
-        return frame, torch.tanh(difference[0].contiguous(memory_format=torch.channels_last))
+        parts = [part.contiguous(memory_format=torch.channels_last) for part in parts]
+        frame = torch.sigmoid(parts[0])
+        return frame, torch.tanh(parts[1]) if self.reconstructs_difference else None
 
     def reconstruct(
         self, frame: torch.Tensor, difference: torch.Tensor
@@ -90,7 +89,7 @@ class VAE(nn.Module):
 
 
 class ColourDeconvolution(nn.ConvTranspose2d):
-    """A transposed convolution to few channels, with stride 2: in half the time forward."""
+    """A transposed convolution to few channels, kernel 6, stride 2: in half the time forward."""
 
     def forward(self, pictures: torch.Tensor) -> torch.Tensor:
         """(batch, channels, n, n) -> (batch, out_channels, 2 n + 4, 2 n + 4)."""
