@@ -284,13 +284,16 @@ def test_the_stop_button_ends_a_live_training_in_one_line_and_the_cell_goes_on(r
     picture = page.locator(".jp-RenderedHTMLCommon img").first
     sees_another_picture(picture, lambda: None)
     page.locator(STOP).first.click()
-    page.get_by_text("stopped: nothing that was logged is lost").wait_for(timeout=1000 * SLOW)
+    stopped = page.get_by_text("stopped: nothing that was logged is lost")
+    stopped.wait_for(timeout=1000 * SLOW)
     drawn = generation(picture)
     page.locator(".jp-CodeCell .cm-content").click()
     page.keyboard.press("Control+Enter")
+    # the old picture may still change, and a stop before the cell has begun stops nothing
+    stopped.wait_for(state="hidden", timeout=1000 * SLOW)
     wait_for(lambda: picture.count() and generation(picture) > drawn, f"a generation after {drawn}")
     page.locator(STOP).first.click()
-    page.get_by_text("stopped: nothing that was logged is lost").wait_for(timeout=1000 * SLOW)
+    stopped.wait_for(timeout=1000 * SLOW)
 
 
 def generation(picture):
