@@ -1,9 +1,9 @@
 """Compiling with Numba: kept on disk wherever that is possible, and announced when it takes long.
 
 Numba keeps compiled code beside the source, or in the user's cache if the package's folder is
-read-only, or in NUMBA_CACHE_DIR. Files are replaced as a whole, so processes that compile at the
-same time do no harm. Where none of these folders can be written, we take one for temporary files.
-Numba compiles one function at a time, so a second process may compile beside this one.
+read-only, or in NUMBA_CACHE_DIR. Where none of these folders can be written, we take one for
+temporary files. A process that finds another one compiling waits, and loads what that has compiled.
+Numba compiles one function at a time, so the one that compiles starts a second process beside it.
 """
 
 import os
@@ -15,10 +15,11 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numba
+from filelock import FileLock, Timeout
 from numba.core import event
 
 NOTICE = "compiling the engine, once: about 20 seconds"
-PATIENCE = 60.0  # seconds to wait for the other process
+PATIENCE = 60.0  # seconds to wait for another process
 
 
 def compiled(function: Callable | None = None, **options) -> Callable:
@@ -59,15 +60,32 @@ class Announcement(event.Listener):
     """
 
     def __init__(self, beside: str | None = None):
-        self.printed, self.beside, self.process = False, beside, None
+        self.printed, self.beside, self.process, self.lock = False, beside, None, None
 
-    def on_start(self, _: event.Event) -> None:
+    def on_start(self, begun: event.Event) -> None:
         """Numba begins to compile a function."""
-        if not self.printed:
-            self.printed = True
-            print(NOTICE, file=sys.stderr, flush=True)
-            if self.beside and sys.executable:
-                self.process = start_python(self.beside)
+        if self.printed:
+            return
+        self.printed = True
+        print(NOTICE, file=sys.stderr, flush=True)
+        waited = self.has_waited(begun.data["dispatcher"].stats.cache_path)
+        if self.beside and sys.executable and not waited:
+            self.process = start_python(self.beside)
+
+    def has_waited(self, folder: str | None) -> bool:
+        """Wait while another process compiles into this folder; whether one did."""
+        if not folder:  # nothing is kept
+            return False
+        self.lock = FileLock(Path(folder) / "compiling.lock", thread_local=False)
+        try:
+            self.lock.acquire(timeout=0)
+        except Timeout:
+            with suppress(Timeout):  # it takes too long: both compile
+                self.lock.acquire(timeout=PATIENCE)
+            return True
+        except (OSError, NotImplementedError):  # a folder without locks: both compile
+            pass
+        return False
 
     def on_end(self, _: event.Event) -> None:
         """Numba has compiled a function."""
@@ -77,6 +95,11 @@ class Announcement(event.Listener):
         if self.process:
             with suppress(subprocess.TimeoutExpired):
                 self.process.wait(PATIENCE)
+
+    def release(self) -> None:
+        """Let a process go on that waits for what this one compiles."""
+        if self.lock:
+            self.lock.release()
 
 
 def start_python(code: str) -> subprocess.Popen:
@@ -93,4 +116,7 @@ def announced(beside: str | None = None) -> Iterator[Announcement]:
     """Announce what is compiled within a `with` block."""
     announcement = Announcement(beside)
     with event.install_listener("numba:compile", announcement):
-        yield announcement
+        try:
+            yield announcement
+        finally:
+            announcement.release()
