@@ -1,4 +1,4 @@
-"""A real Dask scheduler and four workers, processes of their own with their own addresses."""
+"""A real Dask scheduler and two workers, processes of their own with their own addresses."""
 
 import importlib.metadata
 import json
@@ -23,7 +23,7 @@ from stad_lab.io.workers import TaskError, run_tasks
 from stad_lab.training.dataset import collect
 from stad_lab.training.evolution import LOG, evolve
 
-WORKERS = 4
+WORKERS = 2
 QUICK = Config.preset("quick")
 
 
