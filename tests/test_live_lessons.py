@@ -201,6 +201,8 @@ def test_a_bet_counts_once_and_shows_the_answer(opened):
 
 def test_only_the_difference_image_shows_the_speed(opened):
     page = opened("speeds")
+    assert not page.is_visible("#three")  # before a bet nobody needs the answers
+    page.click("#all-three summary")
     pixels = "(canvas) => canvas.getContext('2d').getImageData(0, 0, 64, 64).data.join()"
     for stride in ("Home", "End"):
         page.focus("#stride")
