@@ -26,8 +26,8 @@ from stad_lab.viz.replication import (
 PACKAGE = Path(config.__file__).parent
 PRETRAINED = PACKAGE / "pretrained"
 LAYERS = (
-    "checks", "doctor", "config", "envs", "models", "io", "agent", "dreaming", "training",
-    "evaluation", "viz", "play", "replication", "benchmark", "cli",
+    "checks", "config", "models", "envs", "io", "inference", "agent", "dreaming", "training",
+    "evaluation", "viz", "play", "replication", "doctor", "benchmark", "cli",
 )  # fmt: skip
 AGENTS = (*config.VARIANTS, "cropped_input")
 QUANTITIES = (

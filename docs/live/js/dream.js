@@ -28,7 +28,7 @@ stad.Dream = class {
   }
 };
 
-/** What V and M make of a recorded drive: z of each frame, and M's memory before it. */
+/** What V and M make of a recorded episode: z of each frame, and M's memory before it. */
 stad.Memory = class {
   constructor(vae, mdnRnn, drive) {
     [this.vae, this.mdnRnn, this.drive] = [vae, mdnRnn, drive];

@@ -127,18 +127,18 @@ stad.start(async () => {
     get("bar-gas").style.transform = `scaleX(${gas})`;
     get("bar-brake").style.transform = `scaleX(${brake})`;
     const pedals = `steering ${steering.toFixed(1)}, gas ${gas.toFixed(1)}, brake ${brake.toFixed(1)}`;
-    stad.describe(get("real"), `recorded drive, frame ${t} of ${drive.length}`);
+    stad.describe(get("real"), `recorded episode, frame ${t} of ${drive.length}`);
     const distance = distances.at(-1)?.[1].toFixed(2);
     stad.describe(
       get("dream"),
       dream
         ? `the dream, frame ${dream.frames}, ${wheel}, ${pedals}` +
-            (distance ? `, distance from the recorded drive ${distance}` : "")
+            (distance ? `, distance from the recorded episode ${distance}` : "")
         : `reconstruction of frame ${t} by V, ${pedals}`,
     );
     if (!dream) return;
     const at = `after ${dream.frames} frames`;
-    stad.describe(get("distance"), `distance from the recorded drive ${at}: ${distance ?? "none"}`);
+    stad.describe(get("distance"), `distance from the recorded episode ${at}: ${distance ?? "none"}`);
     stad.describe(
       get("spread"),
       `spread of M's prediction ${at}: ${spreads.at(-1)?.[1].toFixed(2)}`,

@@ -1,5 +1,5 @@
 "use strict";
-// Frames, difference images and recorded drives. As stad_lab/envs/frames.py.
+// Frames, difference images and recorded episodes. As stad_lab/envs/frames.py.
 globalThis.stad ??= {};
 
 stad.FRAME_SIZE = 64; // pixels, width and height of a frame
@@ -34,7 +34,7 @@ stad.readPicture = async (url) => {
   return context;
 };
 
-/** A recorded drive: all frames, and the action on each. */
+/** A recorded episode: all frames, and the action on each. */
 stad.Drive = class {
   /**
    * @param {CanvasRenderingContext2D} sheet all frames side by side
