@@ -22,11 +22,10 @@ def summarise(returns: np.ndarray) -> dict:
 
 
 def describe_tail(returns: np.ndarray) -> dict:
-    """Minimum, tenth percentile, median, share and number of the episodes below 800."""
+    """Minimum, tenth percentile, share and number of the episodes below 800."""
     return {
         "minimum": float(returns.min()),
         "tenth_percentile": float(np.percentile(returns, 10)),
-        "median": float(np.median(returns)),
         "below_800": float((returns < FAILED).mean()),
         "failed": int((returns < FAILED).sum()),
     }

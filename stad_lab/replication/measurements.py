@@ -9,24 +9,11 @@ import numpy as np
 import pandas
 
 from stad_lab.config import VARIANTS
-from stad_lab.evaluation.statistics import FAILED, SOLVED
+from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.replication.tables import key
 
-REFERENCES = (  # conditions of `speed` with which the others of their measure are compared
-    "Gymnasium", "Gymnasium alone, no agent, 2 processes", "V + M + C, 1 thread", "1 car", "plain",
-    "own processes, 1", "stad_lab",
-)  # fmt: skip
-
-
-def describe_fast(episodes: pandas.DataFrame) -> dict:
-    """Agents with the fast renderer on the tracks 0 to 199, by processor."""
-    found = defaultdict(dict)
-    for (agent, processor), scores in episodes.groupby(["agent", "processor"])["return"]:
-        failed = int((scores < FAILED).sum())
-        found[agent][processor] = {"mean": float(scores.mean()), "failed": failed}
-    wide = episodes.pivot(index=["agent", "track"], columns="processor", values="return").dropna()
-    equal = int((wide.nunique(axis=1) == 1).sum())
-    return {**found, "equal_returns": equal, "compared_episodes": len(wide)}
+# Conditions of `speed` with which the others of their measure are compared.
+REFERENCES = ("Gymnasium", "V + M + C, 1 thread", "stad_lab")
 
 
 def yaw_rate_of_z(probe: pandas.DataFrame) -> dict:

@@ -49,8 +49,7 @@ def test_a_verdict_follows_from_the_recipes_that_can_test_the_claim(recipes, wor
         place: {"frame": {"mean": frame}, "input_output": {"difference": 0, "interval": interval}}
         for place, (frame, *interval) in enumerate(recipes)
     }
-    yaw_rate = {"input_output": {"lowest": 0.9}, "others": {"highest": 0.2}}
-    assert claims.find_verdict(found, 940, yaw_rate)["word"] == word
+    assert claims.find_verdict(found, 940)["word"] == word
 
 
 def test_lost_points_add_up_and_a_learning_curve_counts_every_episode():
