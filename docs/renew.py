@@ -7,7 +7,6 @@ a number must not begin a line, which Markdown would take for HTML.
 """
 
 import argparse
-import json
 import re
 import sys
 from pathlib import Path
@@ -15,10 +14,10 @@ from pathlib import Path
 from blocks import BLOCKS, NUMBERS, forest, study_figures
 from gallery import PICTURES
 
+from stad_lab.replication.claims import read_claims
 from stad_lab.viz.plots import to_png
 
 ROOT = Path(__file__).parent.parent
-CLAIMS = ROOT / "stad_lab" / "replication" / "data" / "claims.json"
 FOREST = PICTURES / "claims.png"
 MARKED = re.compile(r"(<!-- claims: ([^>]+?) -->)(.*?)(<!-- /claims -->)", re.S)
 
@@ -64,7 +63,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--check", action="store_true", help="change nothing, name stale pages")
     check = parser.parse_args().check
-    claims = json.loads(CLAIMS.read_text(encoding="utf-8"))
+    claims = read_claims()
     found = stale(claims)
     for file, text in found.items():
         print(f"{'stale' if check else 'renewed'}: {file.relative_to(ROOT)}")

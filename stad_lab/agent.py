@@ -231,7 +231,9 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
     """
     tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
-    if min(tracks, default=0) < 0:
+    if not tracks:
+        raise ValueError("tracks is empty: expected the seed of at least one track")
+    if min(tracks) < 0:
         raise ValueError(f"track {min(tracks)}: expected at least 0, the seed of a track")
     if fast:
         cars = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)

@@ -135,12 +135,10 @@ def result_file(file: Path | None, source: str, kind: str, details: str = "") ->
     """
     from stad_lab.agent import PRETRAINED, run_folder
     from stad_lab.evaluation.evaluate import check_output
-    from stad_lab.io.files import check_writable
 
     run = run_folder(source)
     name = f"{kind}-{run.name}{details}.json"
     file = file or (Path(name) if run.parent == PRETRAINED else run / name)
-    check_writable(file)
     check_output(file)
     return file
 
@@ -302,6 +300,8 @@ def replicate(
 
     folder = output(out)
     if experiment in study.STUDIES:
+        if keep:
+            raise ValueError("--keep is for earlier experiments: a study adds its own pipelines")
         with cluster_of(scheduler) as executor:
             study.run_study(experiment, folder, executor, seeds, only)
         return
@@ -339,13 +339,13 @@ def evaluate_study(
         json: Where to write every episode.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
-    from stad_lab.evaluation.evaluate import check_tracks
-    from stad_lab.io.files import check_writable, save_json
+    from stad_lab.evaluation.evaluate import check_output, check_tracks
+    from stad_lab.io.files import save_json
     from stad_lab.replication.study import evaluate_kept
 
     check_tracks(episodes, first_track)
     if json:
-        check_writable(json)
+        check_output(json)
     found, tracks = {}, range(first_track, first_track + episodes)
     with cluster_of(scheduler) as executor:
         for pipeline, result in evaluate_kept(study, tracks, seeds, only, executor=executor):
@@ -451,15 +451,13 @@ def benchmark(
     """Measure speeds side by side with Gymnasium and EnvPool, on a machine that does nothing else.
 
     Args:
-        parts: Some of parity, renderer, loop, training; all if not given.
+        parts: Some of parity, renderer, loop, training, run; all if not given.
         rounds: How often the contenders take turns.
         json: Where to write every measurement.
     """
     from stad_lab.benchmark import PARTS, benchmark
     from stad_lab.evaluation.evaluate import check_output
-    from stad_lab.io.files import check_writable
 
-    check_writable(json)
     check_output(json)
     benchmark(list(parts) or list(PARTS), rounds, json)
     print(f"\nevery measurement: {json}")

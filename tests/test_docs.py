@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from stad_lab.cli import parse
+from stad_lab.replication.claims import read_claims
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
@@ -92,7 +93,7 @@ def site(tmp_path_factory):
 
 
 def test_no_page_is_stale():
-    claims = json.loads(renew.CLAIMS.read_text(encoding="utf-8"))
+    claims = read_claims()
     assert not renew.stale(claims), "run: python docs/renew.py"
     assert Image.open(renew.FOREST).text["Description"] in PAGES["README.md"].read_text("utf-8")
 

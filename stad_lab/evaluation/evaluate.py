@@ -15,7 +15,13 @@ from tqdm.auto import tqdm
 from stad_lab.agent import Agent, load_agent, run_folder
 from stad_lab.config import TRACK_RANGES
 from stad_lab.evaluation.statistics import SOLVED, summarise
-from stad_lab.io.files import checksum_of_arrays, checksum_of_tensors, load_json, save_json
+from stad_lab.io.files import (
+    check_writable,
+    checksum_of_arrays,
+    checksum_of_tensors,
+    load_json,
+    save_json,
+)
 from stad_lab.io.workers import run_tasks, worker_processes, worker_threads
 from stad_lab.training.evolution import drive_group, hand_out
 from stad_lab.training.pipeline import RUN_FILES
@@ -109,7 +115,8 @@ def report(tracks: list[int], returns: np.ndarray, lengths: np.ndarray) -> dict:
 
 
 def check_output(path: Path) -> None:
-    """Raise ValueError if a result would overwrite something that is no result of its kind."""
+    """Raise ValueError if a result would overwrite anything but a result, OSError if it cannot."""
+    check_writable(path)
     if path.name in RUN_FILES:
         raise ValueError(f"{path} is the name of a run's own file: choose another name")
     if path.exists():
@@ -117,7 +124,7 @@ def check_output(path: Path) -> None:
             kind = load_json(path).get("kind")
         except ValueError:
             kind = "damaged"
-        if kind not in (KIND, "probe", "benchmark"):
+        if kind not in (KIND, "probe", "benchmark", "study"):
             raise ValueError(f"{path} exists and is no earlier result: choose another name")
 
 

@@ -17,7 +17,10 @@ from distributed.comm import get_address_host_port, parse_address
 from stad_lab.io.workers import task_errors
 
 PATIENCE = 60.0  # seconds to wait for a scheduler to answer, and for its first worker
-SAME = ("stad_lab", "torch", "numpy", "gymnasium", "box2d", "pygame-ce", "opencv-python-headless")
+SAME = (
+    "stad_lab", "torch", "numpy", "numba", "gymnasium", "box2d", "pygame-ce",
+    "opencv-python-headless",
+)  # fmt: skip
 REMEDY = "install the same environment.txt on all machines"
 
 

@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import tempfile
 import time
 from collections.abc import Iterator
@@ -57,28 +58,21 @@ def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a crash, or an OSError, leaves the old version or the new one."""
-    temporary = None
+    # A random name, opened exclusively: nobody can have put a link there.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # A random name, opened exclusively: nobody can have put a link there.
-        prefix = f".{path.name}.{os.getpid()}."
-        opened, name = tempfile.mkstemp(".part", prefix, path.parent)
-        temporary = Path(name)
-        with os.fdopen(opened, "wb") as file:
+        with temporary.open("xb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)
         replace(temporary, path)
         sync_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
-        if temporary:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def replace(temporary: Path, path: Path) -> None:

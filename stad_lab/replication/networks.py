@@ -90,13 +90,8 @@ def load_kept_agent(path: Path) -> Agent:
 
 def where_to_get(study: str) -> str:
     """What to do about kept agents that are not there, for a message."""
-    name = archive_name(study)
-    return f"run the study, or unpack {name} of the project's release into {NETWORKS}"
-
-
-def archive_name(study: str) -> str:
-    """The name of a study's archive in a release."""
-    return f"{study}-networks.zip"
+    archive = f"{study}-networks.zip of the project's release"
+    return f"run the study, or unpack {archive} into {NETWORKS}"
 
 
 def archive(out: Path, files: Iterable[tuple[Path, str]], folder: Path = NETWORKS) -> int:

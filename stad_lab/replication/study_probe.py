@@ -64,7 +64,11 @@ def probe_study(
     random = random_trajectories(trajectories, PROBE_SEED, processes)
     drivers = two_drivers(random, processes)
     for seed in missing:
-        encoders = {(one, True): encoder_of_file(file) for one, file in kept[seed].items()}
+        trained = {one: load_kept_world_model(file) for one, file in kept[seed].items()}
+        encoders = {
+            (one, True): encoder_of(model, {"z, h": model.mdn_rnn})
+            for one, model in trained.items()
+        }
         encoders |= {(one, False): untrained(study, one, seed) for one in CONTROLS}
         lines = []
         with fixed_threads():
@@ -99,12 +103,6 @@ def kept_world_models(study: str, seed: int, to: Path, networks: Path) -> dict[s
         if checksum(files[variant].read_bytes()) != recorded(pipeline, to)["kept_world_model"]:
             raise ValueError(f"{files[variant]} is not the file of the recorded run")
     return files
-
-
-def encoder_of_file(file: Path) -> Encoder:
-    """The kept V of a variant, with its M."""
-    model = load_kept_world_model(file)
-    return encoder_of(model, {"z, h": model.mdn_rnn})
 
 
 def untrained(study: str, variant: str, seed: int) -> Encoder:

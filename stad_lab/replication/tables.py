@@ -49,7 +49,7 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
 def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
     """Read a table; ValueError if a column is missing or has gaps, or a line is there twice."""
     (keys, values), path = TABLES[name], folder / f"{name}.csv"
-    table = pandas.read_csv(path, low_memory=False)  # exact from pandas 3.1 on
+    table = pandas.read_csv(path, low_memory=False)
     for column in keys + values:
         if column not in table or table[column].isna().any():
             raise ValueError(f"{path}: column {column!r} is missing or has empty cells")

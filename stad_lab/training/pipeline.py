@@ -286,7 +286,7 @@ def option_of(name: str, value: object) -> str:
 
 def provenance(command: str) -> dict:
     """What a result was made with: versions, machine, command, and the commit of a checkout."""
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", ".")
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", "*.py")
     return {
         "python": platform.python_version(),
         **{package: importlib.metadata.version(package) for package in PACKAGES},
@@ -314,11 +314,11 @@ def processor() -> str:
 
 def git(*arguments: str) -> str | None:
     """What git says about this checkout; None without git or if this file is not in a checkout."""
-    here = Path(__file__)
+    package, this = Path(__file__).parents[1], "training/pipeline.py"
     try:
         # An environment may lie in the checkout of something else, which does not track this file.
-        for command in (["ls-files", "--error-unmatch", here.name], arguments):
-            whole = ["git", "-C", str(here.parent), *command]
+        for command in (["ls-files", "--error-unmatch", this], arguments):
+            whole = ["git", "-C", str(package), *command]
             found = subprocess.run(whole, capture_output=True, text=True, check=True)
         return found.stdout.strip()
     except (OSError, subprocess.CalledProcessError):

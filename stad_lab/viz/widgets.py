@@ -18,10 +18,9 @@ from pygments.lexers import PythonLexer
 
 from stad_lab.evaluation.trajectories import Inspection, Trajectory
 from stad_lab.models.vae import VAE, to_array, to_uint8
+from stad_lab.training.evolution import Watch
 from stad_lab.viz.plots import BLUE, difference_colors, plot_moment, to_png
 from stad_lab.viz.video import enlarged
-
-Watch = Callable[[list[dict]], None]  # what a training calls with its entries so far
 
 
 def show(*figures: Figure) -> HTML:

@@ -642,17 +642,26 @@ def test_a_run_uses_no_network_and_writes_only_into_its_folder(quick_training):
     assert {path.name for path in folder.iterdir()} == weights | others
 
 
-def test_a_commit_is_only_that_of_the_checkout_in_which_the_library_is(tmp_path, monkeypatch):
+def test_a_commit_and_its_changes_are_those_of_the_checkout_in_which_the_library_is(
+    tmp_path, monkeypatch
+):
     if pipeline.git("rev-parse", "HEAD") is None:
         pytest.skip("this is no checkout that git reads")
     subprocess.run(["git", "init", "-q", tmp_path], check=True)
     who = ["-c", "user.name=somebody", "-c", "user.email=somebody@example.org"]
     commit = ["commit", "-q", "--allow-empty", "-m", "Begin a thesis"]
     subprocess.run(["git", "-C", tmp_path, *who, *commit], check=True)
-    copied = shutil.copy(pipeline.__file__, tmp_path)
-    monkeypatch.setattr("stad_lab.training.pipeline.__file__", str(copied))
+    for name in ("training/pipeline.py", "envs/physics.py"):
+        (tmp_path / name).parent.mkdir()
+        shutil.copy(Path(pipeline.__file__).parents[1] / name, tmp_path / name)
+    monkeypatch.setattr("stad_lab.training.pipeline.__file__", str(tmp_path / name))
     found = provenance("there")
     assert found["commit"] is None and found["uncommitted_changes"] is None
+    subprocess.run(["git", "-C", tmp_path, "add", "."], check=True)  # now the library is part of it
+    subprocess.run(["git", "-C", tmp_path, *who, *commit], check=True)
+    assert provenance("there")["uncommitted_changes"] is False
+    (tmp_path / name).write_text("changed")
+    assert provenance("there")["uncommitted_changes"] is True
 
 
 def test_a_run_that_is_made_longer_has_the_new_configuration_in_its_record(quick_run):

@@ -202,6 +202,9 @@ def test_kept_agents_are_driven_on_any_tracks_by_one_command(made, tmp_path, mon
     assert capsys.readouterr().out.startswith("seed0/frame/z: mean return ")
     agents = load_json(tmp_path / "found.json")["agents"]
     assert [one["track"] for one in agents["seed0/frame/z"]["episodes"]] == [5000, 5001]
+    (tmp_path / "record.json").write_text("{}")
+    assert main([*command, "--json", str(tmp_path / "record.json")]) == 2
+    assert "name of a run's own file" in capsys.readouterr().err
     assert main([*command, "--seeds", "1"]) == 2
     assert "unpack tiny-networks.zip of the project's release" in capsys.readouterr().err
 
@@ -212,6 +215,7 @@ def test_kept_agents_are_driven_on_any_tracks_by_one_command(made, tmp_path, mon
         (["study1", "--seeds", "12"], "study 'study1' has no seed 12: it has 0 to 11"),
         (["study1", "--only", "seed0/frame"], "study 'study1' has no pipeline 'seed0/frame'"),
         (["no_bar_frame", "--only", "seed0/frame/z"], "'no_bar_frame' is no study"),
+        (["study1", "--keep"], "--keep is for earlier experiments"),
     ],
 )
 def test_a_wrong_name_ends_in_one_line(options, message, tmp_path, capsys):
