@@ -5,6 +5,7 @@ import inspect
 import itertools
 import json
 import re
+import tomllib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -25,10 +26,6 @@ from stad_lab.viz.replication import (
 
 PACKAGE = Path(config.__file__).parent
 PRETRAINED = PACKAGE / "pretrained"
-LAYERS = (
-    "checks", "config", "models", "envs", "io", "inference", "agent", "dreaming", "training",
-    "evaluation", "viz", "play", "replication", "doctor", "benchmark", "cli",
-)  # fmt: skip
 AGENTS = (*config.VARIANTS, "cropped_input")
 QUANTITIES = (
     "forward speed", "slip speed", "yaw rate", "wheel angle", "road offset", "heading error",
@@ -385,16 +382,14 @@ def modules_list(claims: dict) -> str:
 
 
 def modules() -> list[str]:
-    """All modules of the library, lower layers first."""
+    """All modules of the library, lower layers first, by the contract in pyproject.toml."""
+    settings = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text("utf-8"))
+    layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
+    place = {part: -height for height, one in enumerate(layers) for part in re.findall(r"\w+", one)}
     files = [file.relative_to(PACKAGE).with_suffix("") for file in PACKAGE.rglob("*.py")]
     names = [".".join(file.parts) for file in files if not file.name.startswith("__")]
-    return [f"stad_lab.{name}" for name in sorted(names, key=lambda name: (layer(name), name))]
-
-
-def layer(name: str) -> int:
-    """The place of a module in LAYERS; the last for one that is not listed."""
-    top = name.split(".")[0]
-    return LAYERS.index(top) if top in LAYERS else len(LAYERS)
+    order = sorted(names, key=lambda name: (place[name.split(".")[0]], name))
+    return [f"stad_lab.{name}" for name in order]
 
 
 def gallery(claims: dict) -> str:

@@ -64,10 +64,9 @@ def probe_study(
     random = random_trajectories(trajectories, PROBE_SEED, processes)
     drivers = two_drivers(random, processes)
     for seed in missing:
-        trained = {one: load_kept_world_model(file) for one, file in kept[seed].items()}
+        models = {one: load_kept_world_model(file) for one, file in kept[seed].items()}
         encoders = {
-            (one, True): encoder_of(model, {"z, h": model.mdn_rnn})
-            for one, model in trained.items()
+            (one, True): encoder_of(model, {"z, h": model.mdn_rnn}) for one, model in models.items()
         }
         encoders |= {(one, False): untrained(study, one, seed) for one in CONTROLS}
         lines = []

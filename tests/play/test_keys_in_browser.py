@@ -99,7 +99,7 @@ def test_the_notebook_has_the_keys_while_text_is_typed_and_after_escape(seat):
     before = prompt.inner_text()
     page.keyboard.press("Shift+Enter")
     wait_for(lambda: prompt.inner_text() not in (before, "[*]:"), "a second run of the cell")
-    before = cells()  # Shift+Enter may have added one below the last, for text
+    count = cells()  # Shift+Enter may have added one below the last, for text
     page.locator(".jp-InputPrompt").first.click()
     wait_for(lambda: listening(page), "the orange frame")
     page.keyboard.down("w")
@@ -109,12 +109,12 @@ def test_the_notebook_has_the_keys_while_text_is_typed_and_after_escape(seat):
     assert not listening(page)
     page.locator(".jp-InputPrompt").first.click()
     page.keyboard.press("b")
-    wait_for(lambda: cells() == before + 1, "a new cell")
+    wait_for(lambda: cells() == count + 1, "a new cell")
     reads("pictures a second")
     page.locator(".stad-lab-pixels").hover()  # the pointer on the picture takes them again
     wait_for(lambda: listening(page), "the orange frame")
     page.keyboard.press("b")
-    assert cells() == before + 1
+    assert cells() == count + 1
 
 
 @pytest.mark.parametrize("seat", [700], indirect=True)
