@@ -59,7 +59,9 @@ SCORE = "score.json"
 CARS = 16  # cars that drive in one batch: another number would change last bits of the returns
 THREADS = 1  # that train V and M, on every machine: last bits depend on their number
 WAIT = 120.0  # seconds to wait for another process that writes the tables
+COLLECTING = 3600.0  # seconds to wait for another process that collects the dataset
 STAGES = ("dataset", "vae", "mdn_rnn", "controller", "score")
+MADE_WITH = ("commit", "processor", "threads", "torch", "trained_on")  # that is noted of V and M
 
 
 @dataclass(frozen=True)
@@ -135,24 +137,25 @@ def run_study(
 ) -> None:
     """Run the missing pipelines of a study in `folder/study`, and add each to the tables in `to`.
 
-    After an interruption the same call continues. A seed that another process runs is left to it,
-    so several processes may run a study in the same folder. With `only`, pipelines that the tables
-    have are run, too, and compared with the tables instead of added.
+    After an interruption the same call continues. A variant of a seed that another process runs is
+    left to it, so several processes may run a study in the same folder. With `only`, pipelines that
+    the tables have are run, too, and compared with the tables instead of added.
 
     Raises ValueError as `find_pipelines`, and what `train` raises.
     """
     wanted, root = find_pipelines(study, seeds, only), Path(folder) / study
-    for seed in dict.fromkeys(pipeline.seed for pipeline in wanted):
-        own = [one for one in wanted if one.seed == seed]
-        missing = own if only else unfinished(own, to)
+    for seed, variant in dict.fromkeys((one.seed, one.variant) for one in wanted):
+        own = [one for one in wanted if (one.seed, one.variant) == (seed, variant)]
+        if not only and not unfinished(own, to):
+            continue
         with contextlib.ExitStack() as stack:
             try:
-                if missing:
-                    stack.enter_context(locked(root / f"seed{seed}"))
+                stack.enter_context(locked(root / f"seed{seed}" / variant))
             except BlockingIOError:
-                print(f"{study}: seed {seed} is run by another process", flush=True)
+                print(f"seed{seed}/{variant}: is run by another process", flush=True)
                 continue
-            for pipeline in missing:
+            # Asked again, because another process may have finished them just before.
+            for pipeline in own if only else unfinished(own, to):
                 print(f"{pipeline.name}: {describe_progress(study, wanted, to)}", flush=True)
                 run_pipeline(pipeline, root, executor)
                 if only and recorded(pipeline, to):
@@ -165,13 +168,13 @@ def run_study(
 
 
 def unfinished(pipelines: list[Pipeline], to: Path) -> list[Pipeline]:
-    """Those of a seed that are to be run: of a variant all, if one is not in the tables.
+    """The pipelines of one variant and seed that are to be run: all, if one is not in the tables.
 
     They share V and M, which come out otherwise on another kind of processor. Those whose score is
     in the folder are only added again.
     """
-    lacking = {one.variant for one in pipelines if recorded(one, to) is None}
-    return [one for one in pipelines if one.variant in lacking]
+    lacking = any(recorded(one, to) is None for one in pipelines)
+    return pipelines if lacking else []
 
 
 def run_pipeline(pipeline: Pipeline, root: Path, executor: Executor | None) -> None:
@@ -183,7 +186,8 @@ def run_pipeline(pipeline: Pipeline, root: Path, executor: Executor | None) -> N
     with fixed_threads():
         usual = STUDIES[pipeline.study].config
         shared = config.replace(evolution={"features": usual.evolution.features})
-        train(shared.replace(variant=usual.variant), seed, until="dataset", executor=executor)
+        with locked(seed, COLLECTING):
+            train(shared.replace(variant=usual.variant), seed, until="dataset", executor=executor)
         train(shared, world, seed / "dataset", until="mdn_rnn", executor=executor)
         share_world_model(config, run, world)
         train(config, run, seed / "dataset", executor=executor)
@@ -319,7 +323,7 @@ def describe_run(pipeline: Pipeline, root: Path) -> dict:
     for stage, file in shared.items():
         line[f"seconds.{stage}"] = load_json(file)["seconds"].get(stage, 0.0)
     made_with = load_json(run.parent / RECORD)["made_with"]
-    line |= {f"world_model.{name}": made_with[name] for name in ("commit", "processor", "threads")}
+    line |= {f"world_model.{name}": made_with[name] for name in MADE_WITH}
     score = load_json(run / SCORE, kind="score")
     frames = sum(episode["frames"] for episode in score["episodes"])
     line |= {"seconds.score": score["seconds"], "budget.score.frames": frames}
@@ -345,8 +349,11 @@ def compare(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> str:
     differs = [name for name in CHECKSUMS if was[name] != now[name]]
     if not differs and not other:
         return f"bit-identical to the recorded one, all {len(again)} returns, too"
-    made = f"recorded on {was['processor']}, here {now['processor']}"
-    return f"differs in {', '.join(differs)} and {other} of {len(again)} returns; {made}"
+    made = [
+        f"{line['processor']}, V and M on {line['world_model.trained_on']}" for line in (was, now)
+    ]
+    found = f"differs in {', '.join(differs)} and {other} of {len(again)} returns"
+    return f"{found}; recorded on {made[0]}, here {made[1]}"
 
 
 def describe_score(pipeline: Pipeline, root: Path) -> str:

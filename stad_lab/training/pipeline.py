@@ -294,7 +294,7 @@ def provenance(command: str) -> dict:
         "processor": processor(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),  # the last bits of V and M depend on them
-        "trained_on": str(training_device()),
+        "trained_on": describe_device(),
         "commit": git("rev-parse", "HEAD"),
         "uncommitted_changes": changed if changed is None else bool(changed),
         "command": command,
@@ -310,6 +310,12 @@ def processor() -> str:
     text = listed.read_text() if listed.exists() else ""
     name = text.partition("model name")[2].partition("\n")[0].strip("\t :")
     return f"{name or platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
+
+
+def describe_device() -> str:
+    """What V and M are trained on: "cpu", or "cuda" and the name of the GPU."""
+    device = training_device()
+    return f"cuda, {torch.cuda.get_device_name(device)}" if device.type == "cuda" else "cpu"
 
 
 def git(*arguments: str) -> str | None:

@@ -7,6 +7,7 @@ on the CPU with as many threads, and nearly so on a GPU.
 
 import contextlib
 import math
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -132,12 +133,16 @@ def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[in
 def torch_settings(seed: int, number: int) -> Iterator[torch.device]:
     """Seed torch for a `with` block that makes and trains model `number`; yields its device.
 
-    The caller's random state, default dtype and gradient mode are the same afterwards.
+    On a GPU, too, sums are float32 and repeat bit by bit. The caller's random state, default dtype
+    and gradient mode are the same afterwards.
     """
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or sums of an LSTM may differ
+    exact = torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False)
     device, dtype = training_device(), torch.get_default_dtype()
+    own_stream = torch.random.fork_rng([device] if device.type == "cuda" else [])
     torch.set_default_dtype(torch.float32)
     try:
-        with torch.random.fork_rng([device] if device.type == "cuda" else []), torch.enable_grad():
+        with exact, own_stream, torch.enable_grad():
             torch.manual_seed(int(random_stream("init", seed, number).integers(2**63)))
             yield device
     finally:

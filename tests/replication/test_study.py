@@ -272,14 +272,15 @@ def test_the_networks_that_git_does_not_hold_go_into_an_archive(made, tmp_path, 
     assert not (tmp_path / "bad.zip").exists()
 
 
-def test_a_seed_that_another_process_runs_is_left_to_it(made, tmp_path, capsys):
+def test_a_variant_that_another_process_runs_is_left_to_it(made, tmp_path, capsys):
     held = "from stad_lab.io.files import locked; from pathlib import Path; import sys\n"
     held += "with locked(Path(sys.argv[1])): print(flush=True); sys.stdin.read()"
-    command = [sys.executable, "-c", held, str(tmp_path / "tiny/seed0")]
+    shutil.copytree(made / "tiny", tmp_path / "tiny", ignore=shutil.ignore_patterns(".lock"))
+    command = [sys.executable, "-c", held, str(tmp_path / "tiny/seed0/frame")]
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
     with subprocess.Popen(command, **pipes) as other:
         other.stdout.readline()
         run_study("tiny", tmp_path, seeds=[0], to=tmp_path / "data")
         other.stdin.close()
-    assert "seed 0 is run by another process" in capsys.readouterr().out
-    assert not (tmp_path / "data").exists()
+    assert "seed0/frame: is run by another process" in capsys.readouterr().out
+    assert set(tables.read_study("runs", tmp_path / "data").variant) == {"input_output"}
