@@ -1,11 +1,14 @@
 """Thin ipywidgets around figures: show them, and draw them again when a slider moves."""
 
 import base64
+import contextlib
 import functools
 import html
 import inspect
 import io
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
 
 import ipywidgets
 import numpy as np
@@ -81,12 +84,36 @@ def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]]
     """
     place = DisplayHandle()
     place.display(HTML(""))  # an ordinary output stays in the page when the kernel is gone
+
+    def update(entries: list[dict]) -> None:
+        with interrupted_at_the_end():
+            place.update(show(draw(entries)))
+
     try:
-        train(lambda entries: place.update(show(draw(entries))))
+        train(update)
     except KeyboardInterrupt:
         print("stopped: nothing that was logged is lost, run this cell again to go on")
         return False
     return True
+
+
+@contextlib.contextmanager
+def interrupted_at_the_end() -> Iterator[None]:
+    """Hold an interrupt back until the end of a `with` block, where the main thread runs it.
+
+    Matplotlib's compiled parts can make another error of an interrupt, or lose it.
+    """
+    if threading.current_thread() is not threading.main_thread():  # which has no interrupts
+        yield
+        return
+    held = []
+    before = signal.signal(signal.SIGINT, lambda *_: held.append(True))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held:
+        raise KeyboardInterrupt
 
 
 def slider(low: float, high: float, value: float, label: str) -> ipywidgets.Widget:

@@ -2,6 +2,7 @@
 
 import io
 import re
+import signal
 import time
 
 import numpy as np
@@ -20,6 +21,7 @@ from stad_lab.viz.widgets import (
     show_animation,
     slider,
     view_trajectory,
+    watch_training,
 )
 
 
@@ -111,3 +113,19 @@ def test_a_film_shows_one_frame_of_three(agent):
     assert pages(film_viewer(agent, track=4, first=2, frames=5, kind="webp"))[0] == 2
     with pytest.raises(ValueError, match="frames=0: expected at least 1"):
         film_agent(agent, 4, 0, 0)
+
+
+def test_an_interrupt_within_a_figure_ends_the_training_once_the_figure_is_drawn(capsys):
+    drawn = []
+
+    def draw(entries):
+        signal.raise_signal(signal.SIGINT)
+        drawn.append(len(entries))
+        figure = Figure()
+        figure.set_label("a figure")
+        return figure
+
+    assert watch_training(lambda watch: [watch([{}] * count) for count in (1, 2)], draw) is False
+    assert drawn == [1] and "stopped: " in capsys.readouterr().out
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
