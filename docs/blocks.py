@@ -74,11 +74,13 @@ def verdict(found: dict) -> str:
 def study1(claims: dict) -> str:
     """Study 1: its progress, and after the last seed its tables and figures."""
     found = claims["study1"]
+    on_gpu = sum(count for name, count in found["trained_on"].items() if name != "cpu")
+    trained = f"{on_gpu} of {sum(found['trained_on'].values())} V networks were trained on a GPU."
     if "comparisons" not in found:
         seeds = "{complete_seeds} of {planned_seeds} seeds"
         text = f"**{seeds} are complete** ({{pipelines}} of {{planned_pipelines}} pipelines)."
-        return f"{text} Nothing is tested before the last one.".format(**found)
-    parts = [comparisons_table(found), outcomes_table(found)]
+        return f"{text} {trained} Nothing is tested before the last seed.".format(**found)
+    parts = [trained, comparisons_table(found), outcomes_table(found)]
     return "\n\n".join([*parts, *(image(name, study_figures(claims)) for name in STUDY1_FIGURES)])
 
 

@@ -41,14 +41,19 @@ def describe_study1(folder: Path = tables.DATA, study: str = "study1") -> dict:
 
 
 def describe_progress(planned: Study, runs: pandas.DataFrame) -> dict:
-    """How many seeds and pipelines of a study are in its table of runs, of how many."""
+    """How many seeds and pipelines of a study are in its table of runs, of how many.
+
+    "trained_on" counts the V networks by the machine that trained them.
+    """
     arms = len(planned.variants) * len(planned.features)
     by_seed = runs.groupby("seed").size()
+    world_models = runs.drop_duplicates(["variant", "seed"])
     return {
         "complete_seeds": int((by_seed == arms).sum()),
         "planned_seeds": len(planned.seeds),
         "pipelines": len(runs),
         "planned_pipelines": arms * len(planned.seeds),
+        "trained_on": world_models["world_model.trained_on"].value_counts().to_dict(),
     }
 
 

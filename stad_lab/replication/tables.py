@@ -41,7 +41,9 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
     "study_generations": (
         [*PIPELINE, "generation"], ["worst", "mean", "best", "sigma", "episodes", "frames"],
     ),
-    "study_runs": (PIPELINE, ["processor", "dataset", "kept_controller"]),
+    "study_runs": (
+        PIPELINE, ["processor", "world_model.trained_on", "dataset", "kept_controller"],
+    ),
     "study_probe": ([*PIPELINE, "trained", "driver", "quantity"], ["r2"]),
 }  # fmt: skip
 
@@ -61,7 +63,8 @@ def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
 def read_study(name: str, folder: Path = DATA) -> pandas.DataFrame:
     """The table "episodes", "generations", "runs" or "probe" of the studies, empty if not there."""
     if not (folder / f"study_{name}.csv").exists():
-        return pandas.DataFrame(columns=[*TABLES[f"study_{name}"][0]])
+        keys, values = TABLES[f"study_{name}"]
+        return pandas.DataFrame(columns=[*keys, *values])
     return read(f"study_{name}", folder)
 
 

@@ -44,7 +44,8 @@ def full(tmp_path_factory):
         log |= {"validation": np.where(np.arange(6) % 2, np.repeat(curve, 2), np.nan)}
         log |= dict.fromkeys(("worst", "mean", "best", "sigma", "frames"), 1)
         generations.append(pandas.DataFrame(log).assign(**key))
-        runs.append(key | {"processor": "p", "dataset": "d", "kept_controller": "c"})
+        made = {"world_model.trained_on": "cuda, a GPU" if one.seed > 8 else "cpu"}
+        runs.append(key | made | {"processor": "p", "dataset": "d", "kept_controller": "c"})
     tables.save("study_episodes", pandas.concat(episodes), folder)
     tables.save("study_generations", pandas.concat(generations), folder)
     tables.save("study_runs", pandas.DataFrame(runs), folder)
@@ -158,6 +159,7 @@ def test_nothing_is_tested_before_the_last_pipeline_is_there(full, tmp_path):
         tables.save(f"study_{name}", table[~last], tmp_path)
     assert describe_study1(tmp_path) == {
         "complete_seeds": 11, "planned_seeds": 12, "pipelines": 95, "planned_pipelines": 96,
+        "trained_on": {"cpu": 36, "cuda, a GPU": 12},
     }  # fmt: skip
     assert describe_study1(tmp_path / "empty")["pipelines"] == 0
 
@@ -165,10 +167,10 @@ def test_nothing_is_tested_before_the_last_pipeline_is_there(full, tmp_path):
 def test_the_page_has_the_progress_until_the_last_seed_and_then_every_result(found):
     study3 = {"seeds": 0, "planned_seeds": 12, "networks": 0}
     progress = {"complete_seeds": 3, "planned_seeds": 12, "pipelines": 29, "planned_pipelines": 96}
-    claims = {"study1": progress, "study3": study3}
-    assert "3 of 12 seeds are complete" in blocks.study1(claims) and not blocks.study_figures(
-        claims
-    )
+    claims = {"study1": progress | {"trained_on": {"cpu": 8, "cuda": 7}}, "study3": study3}
+    page = blocks.study1(claims)
+    assert "3 of 12 seeds are complete" in page and "7 of 15 V networks" in page
+    assert not blocks.study_figures(claims)
     claims["study1"] = found
     page = blocks.study1(claims)
     for name, one in found["comparisons"].items():
