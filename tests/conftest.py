@@ -3,6 +3,8 @@
 import os
 
 os.environ.setdefault("STAD_LAB_PRESET", "quick")
+# Dozens of Pythons start here, and each would compile all of our modules again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # A GPU does not repeat its sums bit for bit.
 os.environ.setdefault("CUDA_VISIBLE_DEVICES", "")
 # check_env tries render_mode="human": no window may open.

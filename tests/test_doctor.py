@@ -159,9 +159,12 @@ def test_a_working_folder_that_is_missing_or_read_only_is_red(tmp_path, monkeypa
     def refuse(dir):
         raise PermissionError(f"[Errno 13] Permission denied: '{dir}'")
 
-    missing = line(check_environment(tmp_path / "missing"), "working folder")
+    def working_folder(path):
+        return line(doctor.Report(tuple(doctor.check_folder(path))), "working folder")
+
+    missing = working_folder(tmp_path / "missing")
     monkeypatch.setattr("tempfile.TemporaryFile", refuse)
-    closed = line(check_environment(tmp_path), "working folder")
+    closed = working_folder(tmp_path)
     assert missing.state == closed.state == "red" and missing.remedy and closed.remedy
     assert "there is no such folder" in missing.found and "Permission denied" in closed.found
 

@@ -80,12 +80,6 @@ def test_the_models_import_nothing_but_torch_and_numpy_and_each_other(file):
         assert name.partition(".")[0] in allowed or name.startswith("stad_lab.models."), name
 
 
-def test_the_controller_loads_neither_torch_nor_pygame():
-    loaded = run_python("import sys, stad_lab.models.controller; print(*sys.modules)").split()
-    assert "stad_lab.models.controller" in loaded
-    assert not {"torch", "pygame", "cv2", "Box2D"} & set(loaded)
-
-
 def test_the_command_line_loads_torch_only_when_a_command_needs_it():
     loaded = run_python("import sys, stad_lab.cli; print(*sys.modules)").split()
     assert "stad_lab.cli" in loaded and "torch" not in loaded

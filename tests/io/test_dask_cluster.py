@@ -34,15 +34,15 @@ def scheduler(tmp_path_factory):
     contact, dask = folder / "scheduler.json", [sys.executable, "-m", "dask"]
     # The path is for the tasks that are written in this file.
     environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])
+        "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path]),
+        "DASK_DISTRIBUTED__SCHEDULER__ACTIVE_MEMORY_MANAGER__INTERVAL": "200ms",
     }
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     quiet |= {"cwd": folder, "env": environment}
     options = ["--host", "127.0.0.1", "--port", "0", "--dashboard-address", "127.0.0.1:0"]
     command = [*dask, "scheduler", *options, "--scheduler-file", contact]
     processes = [subprocess.Popen(command, **quiet)]
-    wait_for(contact.exists)
-    time.sleep(0.5)
+    wait_for(lambda: contact.exists() and contact.read_text(encoding="utf-8").endswith("}"))
     address = json.loads(contact.read_text(encoding="utf-8"))["address"]
     options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
     command = [*dask, "worker", address, *options, "--local-directory", folder]
@@ -85,8 +85,8 @@ def open_parcel(parcel, number):
 def test_what_is_shared_is_sent_once_to_every_worker_and_not_with_each_task(scheduler):
     with cluster(scheduler[0]) as executor:
         parcel = executor.share(Parcel())
-        time.sleep(2.5)  # longer than Dask's memory manager keeps what no task waits for
-        futures = [executor.submit(open_parcel, parcel, number) for number in range(40)]
+        time.sleep(0.6)  # longer than Dask's memory manager keeps what no task waits for
+        futures = [executor.submit(open_parcel, parcel, number) for number in range(12)]
         found = [future.result() for future in futures]
     assert len({process for process, _ in found}) == WORKERS
     assert max(arrived for _, arrived in found) == 1

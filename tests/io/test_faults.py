@@ -61,7 +61,8 @@ def whole(quick_run, tmp_path_factory, in_this_process):
 def another(tmp_path_factory, in_this_process):
     """A run of another seed, with checkpoints too."""
     folder = tmp_path_factory.mktemp("faults") / "another"
-    config = QUICK.replace(seed=1, evolution={"generations": 2})
+    brief = {"vae": {"steps": 12}, "mdn_rnn": {"steps": 12}}  # more than `add_checkpoints` makes
+    config = QUICK.replace(seed=1, evolution={"generations": 2}, **brief)
     train(config, folder, executor=in_this_process)
     result = evaluate(folder, 1, fast=True, executor=in_this_process)
     save_json(folder / "evaluation.json", result)

@@ -182,20 +182,22 @@ def test_a_worker_that_loaded_another_stad_lab_is_refused(tmp_path):
 
 SUSPENDED = """
 import time
-from stad_lab.io.workers import run_tasks, worker_processes
+from stad_lab.io.workers import PRELOADED, run_tasks, worker_processes
 
 if __name__ == "__main__":
+    PRELOADED.clear()  # which takes long, and is needed for nothing here
     with worker_processes(1) as executor:
         list(run_tasks(executor, time.sleep, [(0,)]))  # now a worker has started
-        tasks = run_tasks(executor, time.sleep, [(1,)], patience=3)
+        tasks = run_tasks(executor, time.sleep, [(0.3,)], patience=2)
         print("begun", flush=True)
         print(list(tasks))
 """
 ORPHAN = """
 import os, time
-from stad_lab.io.workers import run_tasks, worker_processes
+from stad_lab.io.workers import PRELOADED, run_tasks, worker_processes
 
 if __name__ == "__main__":
+    PRELOADED.clear()
     with worker_processes(1) as executor:
         print(next(run_tasks(executor, os.getpid, [()]))[1], flush=True)
         time.sleep(1000)
@@ -233,7 +235,7 @@ def test_a_run_that_was_suspended_for_longer_than_its_patience_continues(tmp_pat
     with start_script(tmp_path, SUSPENDED) as process:
         assert process.stdout.readline() == "begun\n"
         os.killpg(process.pid, signal.SIGSTOP)
-        time.sleep(4)
+        time.sleep(2.6)
         os.killpg(process.pid, signal.SIGCONT)
         output, errors = process.communicate(timeout=60)
     assert (process.returncode, output, errors) == (0, "[(0, None)]\n", "")

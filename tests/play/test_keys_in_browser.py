@@ -117,12 +117,13 @@ def test_the_notebook_has_the_keys_while_text_is_typed_and_after_escape(seat):
     assert cells() == count + 1
 
 
-@pytest.mark.parametrize("seat", [700], indirect=True)
+@pytest.mark.parametrize("seat", [850], indirect=True)
 def test_keys_that_are_held_when_an_episode_ends_do_not_edit_the_notebook(seat):
     page, reads, cells = seat
     press_drive(page)
     page.keyboard.down("w")
-    page.keyboard.down("d")  # full gas to the right, until the car has left the field
+    page.keyboard.down("d")
+    reads("keys held: gas, right")
     reads("the episode has ended")
     for _ in range(6):
         page.keyboard.down("d")  # a held key repeats

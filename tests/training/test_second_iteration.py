@@ -31,7 +31,8 @@ from stad_lab.training.second_iteration import (
 from stad_lab.training.subspace import START_FILE, load_start
 
 QUICK = Config.preset("quick")
-CONFIG = QUICK.replace(data={"agent_episodes": 3}, processes=1)
+BRIEF = {"vae": {"steps": 8}, "mdn_rnn": {"steps": 4}}
+CONFIG = QUICK.replace(data={"agent_episodes": 3}, processes=1, **BRIEF)
 C = "controller.safetensors"
 
 

@@ -91,13 +91,6 @@ def test_v_is_trained_on_other_noise_in_every_step_and_on_the_same_in_every_run(
     assert all(map(torch.equal, sampled[:half], sampled[half:]))
 
 
-CALLERS = {
-    "another seed": contextlib.nullcontext,
-    "no_grad": torch.no_grad,
-    "float64": lambda: default_dtype(torch.float64),
-}
-
-
 @contextlib.contextmanager
 def default_dtype(dtype):
     torch.set_default_dtype(dtype)
@@ -105,6 +98,15 @@ def default_dtype(dtype):
         yield
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+@contextlib.contextmanager
+def unusual_torch():
+    with default_dtype(torch.float64), torch.no_grad():
+        yield
+
+
+CALLERS = {"another seed": contextlib.nullcontext, "no_grad and float64": unusual_torch}
 
 
 @pytest.mark.parametrize("caller", CALLERS)
@@ -124,7 +126,7 @@ def test_a_training_leaves_torch_as_it_was_and_gives_the_same_v_and_m(
 
 def test_an_interrupted_training_leaves_torch_as_it_was(dataset, tmp_path, interrupt_after):
     state = torch.get_rng_state()
-    with default_dtype(torch.float64), torch.no_grad():
+    with unusual_torch():
         interrupt_after(3)
         with pytest.raises(KeyboardInterrupt):
             train_vae(QUICK, dataset, tmp_path)
@@ -153,17 +155,18 @@ def test_a_half_trained_v_continues_with_another_sigma_and_with_no_other_setting
 
 
 def test_a_checkpoint_made_before_a_setting_existed_continues(dataset, tmp_path, interrupt_after):
+    brief = QUICK.replace(vae={"steps": 12})
     hook = interrupt_after(10)
     with pytest.raises(KeyboardInterrupt):
-        train_vae(QUICK, dataset, tmp_path)
+        train_vae(brief, dataset, tmp_path)
     hook.remove()
     tensors, metadata = load_tensors(tmp_path / CHECKPOINT)
     del metadata["made_with"]["vae"]["difference_weight"]
     trainer.save_tensors(tmp_path / CHECKPOINT, tensors, **metadata)
     older = shutil.copytree(tmp_path, tmp_path / "older")
-    assert train_vae(QUICK, dataset, tmp_path)
+    assert train_vae(brief, dataset, tmp_path)
     with pytest.raises(ValueError, match=r"made with vae.difference_weight=1.0, now vae.differ"):
-        train_vae(QUICK.replace(vae={"difference_weight": 2.0}), dataset, older)
+        train_vae(brief.replace(vae={"difference_weight": 2.0}), dataset, older)
 
 
 def test_values_beyond_the_bounds_of_logvar_and_logsigma_still_have_a_gradient():
