@@ -7,20 +7,23 @@ takes a sixth of PyTorch's time for one car, and two thirds of it for 16.
 Everything is one operation, a layer: a patch of the input, times a matrix, plus a bias. For a
 convolution the patch is what lies below its kernel; for M it is z, the action and h side by side.
 The patches of several pixels or cars are multiplied together, because each weight that was read
-then serves for all of them. `tile` does 6 patches times 16 outputs: 96 sums, which fit into the
-processor's registers, so that only inputs and weights are read from memory. (This is how matrix
+then serves for all of them. `tile` does 6 patches times 16 or 32 outputs: as many sums as fit into
+the processor's registers, so that only inputs and weights are read from memory. (This is how matrix
 libraries do it: Goto and van de Geijn 2008.)
 
 A sum is made in one order, whatever the batch or the width of the processor's vectors: a car's
 numbers do not depend on the other cars of the batch.
 """
 
+import functools
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numba.core import types
 from numba.core.cgutils import ir
+from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic
 
 from stad_lab.envs.compiling import compiled
@@ -29,6 +32,7 @@ from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 
 PATCHES, OUTPUTS = 6, 16  # of a tile: 12 vectors of AVX2, which has 16 registers
+BLOCKS = 2 if "+avx512f" in get_host_cpu_features() else 1  # of OUTPUTS in a tile: 12 of 32 vectors
 KERNEL, STRIDE = 4, 2  # of V's convolutions
 PIXELS = normalise(np.arange(256, dtype=np.uint8))  # every value that a pixel of a frame can have
 
@@ -48,13 +52,13 @@ class Layer(NamedTuple):
     floor: float  # least output: 0 for a ReLU, minus infinity for none
 
 
-@intrinsic
-def tile(typing_context, x, starts, layer_shape, weights, bias, y, ends):
-    """Write the sums of PATCHES patches for OUTPUTS outputs; see `run_layer` for the arguments.
+@intrinsic(prefer_literal=True)
+def tile(typing_context, x, starts, layer_shape, weights, bias, y, ends, blocks):
+    """Write the sums of PATCHES patches for `blocks` times OUTPUTS outputs; see `run_layer`.
 
     Written for LLVM, because no loop in Python makes Numba keep the sums in registers.
     """
-    signature = types.void(x, starts, layer_shape, weights, bias, y, ends)
+    signature = types.void(x, starts, layer_shape, weights, bias, y, ends, blocks)
 
     def generate(context, builder, signature, arguments):
         def pointer(position):
@@ -70,10 +74,11 @@ def tile(typing_context, x, starts, layer_shape, weights, bias, y, ends):
         vector, integer = ir.VectorType(ir.FloatType(), OUTPUTS), ir.IntType(64)
         all_zero = ir.Constant(ir.VectorType(ir.IntType(32), OUTPUTS), [0] * OUTPUTS)
         undefined, zero, one = ir.Constant(vector, ir.Undefined), integer(0), integer(1)
-        inputs, outputs = pointer(0), pointer(5)
+        inputs, outputs, wide = pointer(0), pointer(5), range(signature.args[7].literal_value)
         rows, row, run, floor = unpack(2)
 
-        def address(array, index):
+        def address(array, *distances):
+            index = functools.reduce(builder.add, distances)
             return builder.bitcast(builder.gep(array, [index]), vector.as_pointer())
 
         def spread(scalar):
@@ -96,17 +101,21 @@ def tile(typing_context, x, starts, layer_shape, weights, bias, y, ends):
             builder.cbranch(goes_on, block, after)
             builder.position_at_end(after)
 
-        sums = [builder.load(address(pointer(4), zero), align=4)] * PATCHES
-        patches = unpack(1)
+        columns = [integer(OUTPUTS * block) for block in wide]
+        size = builder.mul(builder.mul(rows, run), integer(OUTPUTS))  # of the weights of a block
+        skipped = [builder.mul(size, integer(block)) for block in wide]
+        begin = [builder.load(address(pointer(4), column), align=4) for column in columns]
+        patches, sums = unpack(1), begin * PATCHES
         outer, (number, base, weight, *sums) = begin_loop("row", zero, zero, zero, *sums)
         end = builder.add(base, run)
         inner, (at, at_weight, *partial) = begin_loop("run", base, weight, *sums)
-        factors = builder.load(address(pointer(3), at_weight), align=4)
+        factors = [builder.load(address(pointer(3), at_weight, part), align=4) for part in skipped]
+        values = [builder.load(builder.gep(inputs, [builder.add(start, at)])) for start in patches]
         added = []
-        for patch, total in zip(patches, partial, strict=True):
-            value = builder.load(builder.gep(inputs, [builder.add(patch, at)]))
+        pairs = itertools.product(map(spread, values), factors)
+        for (value, factor), total in zip(pairs, partial, strict=True):
             # "contract": multiply and add in one instruction, rounded once.
-            product = builder.fmul(spread(value), factors, flags=["contract"])
+            product = builder.fmul(value, factor, flags=["contract"])
             added.append(builder.fadd(product, total, flags=["contract"]))
         following = builder.add(at, one)
         next_weight = builder.add(at_weight, integer(OUTPUTS))
@@ -117,9 +126,11 @@ def tile(typing_context, x, starts, layer_shape, weights, bias, y, ends):
         goes_on = builder.icmp_signed("<", next_row, rows)
         end_loop(outer, (number, base, weight, *sums), values, goes_on)
         least = spread(floor)
-        for place, total in zip(unpack(6), added, strict=True):
+        for (place, column), total in zip(
+            itertools.product(unpack(6), columns), added, strict=True
+        ):
             kept = builder.select(builder.fcmp_ordered("<", total, least), least, total)
-            builder.store(kept, address(outputs, place), align=4)
+            builder.store(kept, address(outputs, place, column), align=4)
         return context.get_dummy_value()
 
     return signature, generate
@@ -130,9 +141,11 @@ def run_layer(x: np.ndarray, layer: Layer, y: np.ndarray) -> None:
     """y = max(patches of x times weights + bias, floor); x, y flat, y (patches x outputs)."""
     starts, width, last = layer.starts, len(layer.bias), len(layer.starts) - 1
     shape = layer.rows, layer.row, layer.run, np.float32(layer.floor)
-    for block in range(len(layer.weights)):  # its weights stay in the cache
-        weights, to = layer.weights[block].ravel(), OUTPUTS * block
-        bias = layer.bias[to : to + OUTPUTS]
+    blocks = len(layer.weights)
+    step = BLOCKS if blocks % BLOCKS == 0 else 1
+    for block in range(0, blocks, step):  # their weights stay in the cache
+        weights, to = layer.weights[block:].ravel(), OUTPUTS * block
+        bias = layer.bias[to:]
         for first in range(0, last + 1, PATCHES):
             # A last tile with fewer patches repeats one.
             a, b, c = first, min(first + 1, last), min(first + 2, last)
@@ -142,7 +155,10 @@ def run_layer(x: np.ndarray, layer: Layer, y: np.ndarray) -> None:
                 a * width + to, b * width + to, c * width + to,
                 d * width + to, e * width + to, f * width + to,
             )  # fmt: skip
-            tile(x, begin, shape, weights, bias, y, ends)
+            if step == 1:
+                tile(x, begin, shape, weights, bias, y, ends, 1)
+            else:
+                tile(x, begin, shape, weights, bias, y, ends, BLOCKS)
 
 
 @compiled
