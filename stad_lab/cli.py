@@ -375,21 +375,6 @@ def probe_study(
     print(f"probed the seeds {probed}" if probed else "no further seed is complete: nothing to do")
 
 
-def archive_study(study: tyro.conf.Positional[str], out: str) -> None:
-    """Pack the kept agents of a study that the repository does not hold, for a release.
-
-    Args:
-        study: Its name, such as study1.
-        out: The archive, for example study1-networks.zip.
-    """
-    from stad_lab.io.files import check_writable
-    from stad_lab.replication.study import archive_study
-
-    file = output(out)
-    check_writable(file)
-    print(f"packed {archive_study(study, file)} files into {file}")
-
-
 def claims() -> None:
     """Compute every statistic of the replication from its tables, and write claims.json."""
     from stad_lab.replication.claims import write_claims
@@ -512,7 +497,6 @@ COMMANDS: dict[str, Callable] = {
     "replicate": replicate,
     "evaluate-study": evaluate_study,
     "probe-study": probe_study,
-    "archive-study": archive_study,
     "claims": claims,
     "probe": probe,
     "latents": latents,

@@ -1,8 +1,5 @@
 """The trained agents of a study, kept in half precision: what driving needs of V, M and C.
 
-The repository holds those of the seeds IN_GIT. `archive` puts the others into one file for a
-release.
-
 In the folder of a study::
 
     seed0/frame/world_model.safetensors   V's encoder and M's LSTM
@@ -14,9 +11,6 @@ them, so that anyone can drive it again.
 """
 
 import dataclasses
-import io
-import zipfile
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +18,7 @@ import torch
 
 from stad_lab.agent import Agent
 from stad_lab.config import Config
-from stad_lab.io.files import checksum, load_into, save_tensors, write_bytes
+from stad_lab.io.files import load_into, save_tensors
 from stad_lab.io.weights import (
     WorldModel,
     check_belongs,
@@ -37,7 +31,6 @@ from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 
 NETWORKS = Path(__file__).parent / "networks"  # in the repository, not in what pip installs
-IN_GIT = range(6)  # seeds of study1: all twelve would need 50 MB
 WORLD_MODEL_FILE = "world_model.safetensors"
 KIND = "driving world model"
 DRIVES = {"vae": "encoder.", "mdn_rnn": "lstm."}  # the part of each network that driving needs
@@ -88,24 +81,6 @@ def load_kept_agent(path: Path) -> Agent:
     return Agent(world_model, parameters)
 
 
-def where_to_get(study: str) -> str:
+def how_to_get(study: str) -> str:
     """What to do about kept agents that are not there, for a message."""
-    archive = f"{study}-networks.zip of the project's release"
-    return f"run the study, or unpack {archive} into {NETWORKS}"
-
-
-def archive(out: Path, files: Iterable[tuple[Path, str]], folder: Path = NETWORKS) -> int:
-    """Write kept files (path, its checksum) of `folder` into a zip archive; returns their number.
-
-    The same files give the same archive, byte by byte. ValueError if one has another checksum.
-    """
-    packed, count = io.BytesIO(), 0
-    with zipfile.ZipFile(packed, "w") as pack:
-        for path, expected in files:
-            content = path.read_bytes()
-            if checksum(content) != expected:
-                raise ValueError(f"{path} is not the file of the recorded run")
-            pack.writestr(zipfile.ZipInfo(path.relative_to(folder).as_posix()), content)
-            count += 1
-    write_bytes(out, packed.getvalue())
-    return count
+    return f"make them with `python -m stad_lab replicate {study}`"

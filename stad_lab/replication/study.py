@@ -40,14 +40,12 @@ from stad_lab.io.weights import load_world_model
 from stad_lab.io.workers import run_in_order, worker_threads
 from stad_lab.replication import tables
 from stad_lab.replication.networks import (
-    IN_GIT,
     NETWORKS,
     WORLD_MODEL_FILE,
-    archive,
+    how_to_get,
     keep_controller,
     keep_world_model,
     load_kept_agent,
-    where_to_get,
 )
 from stad_lab.replication.run import share_world_model
 from stad_lab.replication.tables import PIPELINE
@@ -394,26 +392,9 @@ def evaluate_kept(
     wanted, folder = find_pipelines(study, seeds, only), networks / study
     there = [one for one in wanted if kept_file(one, folder).exists()]
     if not there or (only and len(there) < len(wanted)):
-        raise FileNotFoundError(f"{folder} has no agents of these names: {where_to_get(study)}")
+        raise FileNotFoundError(f"{folder} has no agents of these names: {how_to_get(study)}")
     if others := len(wanted) - len(there):
-        print(f"{others} agents are not there: {where_to_get(study)}", flush=True)
+        print(f"{others} agents are not there: {how_to_get(study)}", flush=True)
     for pipeline in there:
         agent = load_kept_agent(kept_file(pipeline, folder))
         yield pipeline, drive_tracks(agent, tracks, 2, executor, pipeline.name)
-
-
-def archive_study(study: str, out: Path, to: Path = tables.DATA, networks: Path = NETWORKS) -> int:
-    """Write the recorded agents that the repository does not hold into a zip archive `out`.
-
-    Returns the number of files. ValueError if none is recorded, or if a file is not the recorded
-    one; FileNotFoundError if it is missing.
-    """
-    files = {}
-    for pipeline in find_pipelines(study):
-        if pipeline.seed not in IN_GIT and (line := recorded(pipeline, to)):
-            path = kept_file(pipeline, networks / study)
-            files[path.with_name(WORLD_MODEL_FILE)] = line["kept_world_model"]
-            files[path] = line["kept_controller"]
-    if not files:
-        raise ValueError(f"{study} has no recorded agents but those of the repository")
-    return archive(out, files.items(), networks)

@@ -27,8 +27,8 @@ from stad_lab.replication.latents import (
 from stad_lab.replication.networks import (
     NETWORKS,
     WORLD_MODEL_FILE,
+    how_to_get,
     load_kept_world_model,
-    where_to_get,
 )
 from stad_lab.replication.study import (
     STUDIES,
@@ -98,7 +98,7 @@ def kept_world_models(study: str, seed: int, to: Path, networks: Path) -> dict[s
         pipeline = Pipeline(study, variant, STUDIES[study].features[0], seed)
         files[variant] = networks / study / f"seed{seed}" / variant / WORLD_MODEL_FILE
         if not files[variant].exists():
-            raise FileNotFoundError(f"{files[variant]} is not there: {where_to_get(study)}")
+            raise FileNotFoundError(f"{files[variant]} is not there: {how_to_get(study)}")
         if checksum(files[variant].read_bytes()) != recorded(pipeline, to)["kept_world_model"]:
             raise ValueError(f"{files[variant]} is not the file of the recorded run")
     return files

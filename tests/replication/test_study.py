@@ -206,7 +206,7 @@ def test_kept_agents_are_driven_on_any_tracks_by_one_command(made, tmp_path, mon
     assert main([*command, "--json", str(tmp_path / "record.json")]) == 2
     assert "name of a run's own file" in capsys.readouterr().err
     assert main([*command, "--seeds", "1"]) == 2
-    assert "unpack tiny-networks.zip of the project's release" in capsys.readouterr().err
+    assert "make them with `python -m stad_lab replicate tiny`" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -250,26 +250,6 @@ def test_v_and_m_of_a_complete_seed_are_probed_once_with_untrained_controls(
     given["networks"] = tmp_path / "networks"
     with pytest.raises(ValueError, match="not the file of the recorded run"):
         probe_study("tiny", **given | {"to": made / "data"})
-
-
-def test_the_networks_that_git_does_not_hold_go_into_an_archive(made, tmp_path, monkeypatch):
-    given = {"to": made / "data", "networks": made / "networks"}
-    with pytest.raises(ValueError, match="tiny has no recorded agents but those of"):
-        study.archive_study("tiny", tmp_path / "none.zip", **given)
-    monkeypatch.setattr(study, "IN_GIT", range(0))
-    files = [tmp_path / name for name in ("one.zip", "two.zip")]
-    assert [study.archive_study("tiny", file, **given) for file in files] == [6, 6]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    shutil.unpack_archive(files[0], tmp_path / "unpacked")
-    (_, result), *others = evaluate_kept(
-        "tiny", range(1000, 1001), only=["seed0/frame/z"], networks=tmp_path / "unpacked"
-    )
-    assert not others and len(result["episodes"]) == 1
-    shutil.copytree(made / "networks", tmp_path / "networks")
-    (tmp_path / "networks/tiny/seed0/frame/z.safetensors").write_bytes(b"another")
-    with pytest.raises(ValueError, match="not the file of the recorded run"):
-        study.archive_study("tiny", tmp_path / "bad.zip", made / "data", tmp_path / "networks")
-    assert not (tmp_path / "bad.zip").exists()
 
 
 def test_a_variant_that_another_process_runs_is_left_to_it(made, tmp_path, capsys):
