@@ -13,12 +13,14 @@ from gallery import CELLS, PICTURES
 from PIL import Image
 
 from stad_lab import cli, config
+from stad_lab.replication.claims import PAPER
 from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
+from stad_lab.replication.verdict import describe_verdict, format_p
 from stad_lab.viz.replication import (
-    CONDITIONS,
     SEEN,
+    SOURCES,
+    TURNING,
     difference_of,
-    plot_forest,
     plot_learning_curves,
     plot_representation,
     plot_study,
@@ -48,40 +50,76 @@ def fixed(value: float) -> str:
 # The replication
 
 
-def results_table(claims: dict) -> str:
-    """Each variant against `frame`, condition by condition."""
-    lines = []
-    for condition, title in CONDITIONS.items():
-        found = claims["recipes"][condition]
-        for variant in config.VARIANTS[1:]:
-            one = found[variant]
-            means = (f"{found['frame']['mean']:.0f}", f"{one['mean']:.0f}", difference_of(one))
-            name = f"{title[0]} `{variant}`"
-            runs = str(len(one["runs"]))
-            outcome = verdict(claims["verdict"][condition])
-            lines.append((name, runs, *means, f"{one['welch_p']:.2f}", outcome))
-    head = ("condition, variant", "runs", "`frame`", "variant", "difference", "p", "verdict")
-    return table(head, lines)
+def paper_table(claims: dict) -> str:
+    """What the paper reports."""
+    sees = ("frame", "both", "frame", "both"), ("frame", "frame", "both", "both")
+    lines = [
+        (f"`{variant}`", *seen, f"{score:.0f}")
+        for (variant, score), *seen in zip(PAPER.items(), *sees, strict=True)
+    ]
+    return table(("variant", "V sees", "V reconstructs", "points"), lines)
 
 
-def verdict(found: dict) -> str:
-    """What a condition says about the claim."""
-    if not found["baseline_passes"]:
-        return "inconclusive: baseline fails"
-    return found["outcome"] if found["has_room"] else "inconclusive: ceiling"
+def finding(claims: dict) -> str:
+    """The finding of the replication in the overview: the verdict, and what z carries."""
+    yaw = {name: yaw_rates(claims, name) for name in config.VARIANTS}
+    others = max(value for name in config.VARIANTS[:3] for value in yaw[name])
+    told = " ".join(describe_verdict(claims["study1"])[:3])
+    return (
+        f"{told}\n\nWhat replicates is in the latents: while an agent drives, only z of"
+        " `input_output` carries the yaw rate, how fast the car turns (R2 at least"
+        f" {min(yaw['input_output']):.2f}, others at most {others:.2f})."
+    )
+
+
+def yaw_rates(claims: dict, variant: str) -> list[float]:
+    """R2 of the yaw rate from z while the agent drives, of all V networks of study 3."""
+    return claims["study3"][f"agent: {variant}"]["z"]["yaw rate"]["values"]
+
+
+def verdict(claims: dict) -> str:
+    """The verdict of study 1, a line for each sentence."""
+    return "\n".join(f"- {sentence}" for sentence in describe_verdict(claims["study1"]))
+
+
+def gains(claims: dict) -> str:
+    """The two primary differences in one line, for the front page."""
+    if "comparisons" not in (found := claims["study1"]):
+        return describe_verdict(found)[0]
+    told = [
+        f"{difference_of(found['comparisons'][f'{features}: input_output'])} points if {seen}"
+        for features, seen in SEEN.items()
+    ]
+    return f"In our study `input_output` differs from `frame` by {' and '.join(told)}."
+
+
+def verdict_figure(claims: dict) -> str:
+    """The forest plot of study 1 for the overview; nothing before the last seed."""
+    found = image("study1", study_figures(claims)) if "comparisons" in claims["study1"] else ""
+    return found.replace("../notebooks", "notebooks")
 
 
 def study1(claims: dict) -> str:
-    """Study 1: its progress, and after the last seed its tables and figures."""
+    """Study 1: after the last seed its tests and the forest plot; nothing before."""
     found = claims["study1"]
-    on_gpu = sum(count for name, count in found["trained_on"].items() if name != "cpu")
-    trained = f"{on_gpu} of {sum(found['trained_on'].values())} V networks were trained on a GPU."
     if "comparisons" not in found:
-        seeds = "{complete_seeds} of {planned_seeds} seeds"
-        text = f"**{seeds} are complete** ({{pipelines}} of {{planned_pipelines}} pipelines)."
-        return f"{text} {trained} Nothing is tested before the last seed.".format(**found)
-    parts = [trained, comparisons_table(found), outcomes_table(found)]
-    return "\n\n".join([*parts, *(image(name, study_figures(claims)) for name in STUDY1_FIGURES)])
+        return "They appear here when the last seed is complete."
+    return f"{comparisons_table(found)}\n\n{image('study1', study_figures(claims))}"
+
+
+def outcomes(claims: dict) -> str:
+    """The secondary outcomes of study 1, with the learning curves."""
+    found = claims["study1"]
+    if "comparisons" not in found:
+        return "They appear here when the last seed is complete."
+    return f"{outcomes_table(found)}\n\n{image('study1_curves', study_figures(claims))}"
+
+
+def on_gpu(claims: dict) -> str:
+    """How many V networks were trained on a GPU."""
+    trained = claims["study1"]["trained_on"]
+    count = sum(number for name, number in trained.items() if name != "cpu")
+    return f"{count} of {sum(trained.values())}"
 
 
 def comparisons_table(study: dict) -> str:
@@ -92,20 +130,17 @@ def comparisons_table(study: dict) -> str:
             arm = f"{features}: {variant}"
             one, arms = study["comparisons"][arm], study["arms"]
             means = [f"{arms[name]['mean']:.0f}" for name in (f"{features}: frame", arm)]
-            p = [p_value(one[key]) for key in ("p", "holm_p")]
+            p = [format_p(one[key]).removeprefix("= ") for key in ("p", "holm_p")]
             outcome = one["verdict"]
             if outcome == "undecided":
                 outcome += f": {one['seeds_that_decide']} seeds would decide"
             name = f"`{variant}`, {SEEN[features]}"
             pipelines = str(len(one["by_seed"]))
-            lines.append((family, name, pipelines, *means, difference_of(one), *p, outcome))
-    head = ("test", "variant", "pairs", "`frame`", "variant", "difference", "p", "Holm's p")
-    return table((*head, "verdict"), lines)
-
-
-def p_value(p: float) -> str:
-    """Three decimals, or that it is smaller."""
-    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
+            scatter = f"{one['deviation']:.0f}"
+            cells = (family, name, pipelines, *means, difference_of(one), scatter, *p, outcome)
+            lines.append(cells)
+    head = ("test", "variant", "pairs", "`frame`", "variant", "difference (95% interval)")
+    return table((*head, "SD of pairs", "p", "Holm's p", "verdict"), lines)
 
 
 def outcomes_table(study: dict) -> str:
@@ -129,38 +164,47 @@ def outcomes_table(study: dict) -> str:
     return table((*head, "area under the learning curve", "less `frame`"), lines)
 
 
-def study3(claims: dict) -> str:
-    """Study 3: R2 from z, and in brackets from z and h, means over the seeds so far."""
-    found = claims["study3"]
-    text = "{seeds} of {planned_seeds} seeds are probed ({networks} V networks).".format(**found)
-    if not (names := [name for name in found if name.startswith("agent: ")]):
-        return text
-    order = sorted(names, key=lambda name: ("untrained" in name, len(name)))
-    lines = [(f"`{name[7:]}`".replace(", untrained`", "`, untrained"),
-              *(r2_cell(found[name], quantity) for quantity in QUANTITIES))
-             for name in order]  # fmt: skip
-    picture = image("study3", study_figures(claims))
-    return "\n\n".join([text, table(("V", *QUANTITIES), lines), picture])
+def study3(claims: dict, driver: str) -> str:
+    """R2 from z, and from z and h, with one driver: means over the seeds so far with intervals."""
+    found, lines = claims["study3"], []
+    names = [name for name in found if name.startswith(f"{driver}: ")]
+    names = sorted(names, key=lambda name: ("untrained" in name, len(name)))
+    for features, name in itertools.product(FEATURES, names):
+        cells = [r2_cell(found[name][features][quantity]) for quantity in QUANTITIES]
+        lines.append([network(name.partition(": ")[2]), SOURCES[features], *cells])
+    return table(("V", "from", *QUANTITIES), lines)
 
 
-def r2_cell(found: dict, quantity: str) -> str:
-    """The mean of R2 from z with its interval, and in brackets that from z and h."""
-    alone, both = (found[features][quantity] for features in FEATURES)
-    low, high = (fixed(bound) for bound in alone["interval"])
-    return f"{fixed(alone['mean'])}, {low} to {high} ({fixed(both['mean'])})"
+def turning_table(claims: dict) -> str:
+    """R2 from z of what a single frame does not show, while an agent drives."""
+    lines = []
+    for name in (*config.VARIANTS, "input_output, untrained"):
+        found = claims["study3"][f"agent: {name}"]["z"]
+        lines.append([network(name), *(r2_cell(found[quantity]) for quantity in TURNING)])
+    return table(("V", *TURNING), lines)
 
 
-STUDY1_FIGURES = ("study1", "study1_curves")
+def network(name: str) -> str:
+    """The name of a V in Markdown: only its variant is code."""
+    variant, *rest = name.split(", ")
+    return ", ".join([f"`{variant}`", *rest])
+
+
+def r2_cell(one: dict) -> str:
+    """The mean of R2 with its interval."""
+    low, high = (fixed(bound) for bound in one["interval"])
+    return f"{fixed(one['mean'])} ({low} to {high})"
 
 
 def study_figures(claims: dict) -> dict:
     """The figures of the studies for which there is data: name of the file -> Figure."""
     one, three, figures = claims["study1"], claims["study3"], {}
     if "comparisons" in one:
-        drawn = plot_study(one["comparisons"], MARGIN), plot_learning_curves(one["curves"])
-        figures |= dict(zip(STUDY1_FIGURES, drawn, strict=True))
+        figures["study1"] = plot_study(one["comparisons"], MARGIN)
+        figures["study1_curves"] = plot_learning_curves(one["curves"])
     if three["seeds"] > 1:
         figures["study3"] = plot_representation(three)
+        figures["study3_random"] = plot_representation(three, "random_driver")
     return figures
 
 
@@ -191,34 +235,10 @@ def r2(claims: dict, driver: str, world_model: str, features: str = "z") -> dict
     return claims["probe"][f"{driver}: {world_model}"].get(features, {})
 
 
-def trainings(claims: dict, variant: str) -> list[str]:
-    """The measured V networks of a variant without the indicator bar, by their names in `probe`."""
-    names = [name.partition(": ")[2] for name in claims["probe"] if name.startswith("agent: ")]
-    return [one for one in names if re.fullmatch(rf"(cropped|no_bar|paper)_{variant}-\d+", one)]
-
-
-def representation_table(claims: dict, quantities: tuple[str, ...] = QUANTITIES) -> str:
-    """The range of R2 from z over the trainings of each variant, while the agent drives."""
-    lines = []
-    for variant in config.VARIANTS:
-        found = [r2(claims, "agent", one) for one in trainings(claims, variant)]
-        ranges = [spread([one[quantity] for one in found]) for quantity in quantities]
-        lines.append((f"`{variant}`", str(len(found)), *ranges))
-    return table(("variant", "trainings", *quantities), lines)
-
-
-def spread(values: list[float]) -> str:
-    """The lowest and the highest value."""
-    return f"{min(values):.2f} to {max(values):.2f}"
-
-
-def latents_table(claims: dict, driver: str) -> str:
-    """R2 from z, and in brackets from z and h, of one training of each variant."""
-    groups = {"cropped_{}": "`{}`", "{}": "`{}`, indicator bar visible"}
-    names = [(group.format(one), title.format(one)) for group, title in groups.items()
-             for one in config.VARIANTS]  # fmt: skip
-    names += [(f"untrained_cropped_{one}", f"`{one}`, untrained") for one in config.VARIANTS[::3]]
-    return table(("V", *QUANTITIES), [probe_line(claims, driver, *name) for name in names])
+def bar_table(claims: dict) -> str:
+    """R2 of one training of each variant with the indicator bar, while the agent drives."""
+    lines = [probe_line(claims, "agent", one, f"`{one}`") for one in config.VARIANTS]
+    return table(("V", *QUANTITIES), lines)
 
 
 def probe_line(claims: dict, driver: str, world_model: str, title: str) -> tuple[str, ...]:
@@ -231,24 +251,18 @@ def probe_line(claims: dict, driver: str, world_model: str, title: str) -> tuple
     return (title, *cells)
 
 
-def random_yaw(claims: dict) -> list[float]:
-    """R2 of the yaw rate from z of `input_output` under the random driver, of each training."""
-    names = trainings(claims, "input_output")
-    return [r2(claims, "random_driver", one)["yaw rate"] for one in names]
-
-
 # The agents
 
 
 def agents_table(claims: dict) -> str:
     """The shipped agents, one line each."""
-    head = ("agent", "mean", "minimum", "10th percentile", "below 800", "Gymnasium")
+    head = ("agent", "mean", "minimum", "10th percentile", "below 800")
     lines = []
     for name in AGENTS:
         one = claims["agents"][name]
         scores = [f"{one[key]:.1f}" for key in ("mean", "minimum", "tenth_percentile")]
         card = f"[`{name}`](stad_lab/pretrained/{name}/README.md)"
-        lines.append((card, *scores, f"{one['below_800']:.0%}", one["gymnasium"]))
+        lines.append((card, *scores, f"{one['below_800']:.0%}"))
     return table(head, lines)
 
 
@@ -402,20 +416,23 @@ def gallery(claims: dict) -> str:
     return "\n".join(f"![{text}](../notebooks/pictures/{file.name})" for file, text in pairs)
 
 
-def forest(claims: dict):
-    """The figure of the claim, a matplotlib Figure."""
-    return plot_forest(claims["recipes"], claims["verdict"]["best_episode"])
-
-
 BLOCKS: dict[str, Callable[[dict], str]] = {
     "agents": agents_table,
-    "results": results_table,
+    "paper": paper_table,
+    "finding": finding,
+    "verdict": verdict,
+    "gains": gains,
+    "verdict's figure": verdict_figure,
+    "on gpu": on_gpu,
     "study1": study1,
-    "study3": study3,
-    "representation": representation_table,
-    "representation of turning": lambda claims: representation_table(claims, QUANTITIES[1:4]),
-    "latents, agent": lambda claims: latents_table(claims, "agent"),
-    "latents, random driver": lambda claims: latents_table(claims, "random_driver"),
+    "outcomes": outcomes,
+    "turning": turning_table,
+    "study3, agent": lambda claims: study3(claims, "agent"),
+    "study3, random driver": lambda claims: study3(claims, "random_driver"),
+    "study3, figures": lambda claims: "\n\n".join(
+        image(name, study_figures(claims)) for name in ("study3", "study3_random")
+    ),
+    "indicator bar": bar_table,
     "experiments": experiments_table,
     "renderer": lambda claims: speed_table(
         claims, "renderer: frames a second on one core", "renderer"
@@ -428,8 +445,6 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "settings": settings_table,
     "modules": modules_list,
     "gallery": gallery,
-    "figure": lambda claims: f"![{forest(claims).get_label()}](notebooks/pictures/claims.png)",
-    "figure in docs": lambda claims: BLOCKS["figure"](claims).replace("(note", "(../note"),
 }
 BLOCKS |= {f"card {name}": lambda claims, name=name: card(claims, name) for name in AGENTS}
 BLOCKS |= {f"recipe {name}": lambda claims, name=name: recipe(name) for name in AGENTS}
@@ -439,14 +454,10 @@ BLOCKS |= {
 }
 
 
-def our_means(claims: dict) -> list[float]:
-    """The means of the four variants with two iterations."""
-    return [claims["recipes"]["two_iterations"][one]["mean"] for one in config.VARIANTS]
-
-
 NUMBERS: dict[str, Callable[[dict], float]] = {
-    "lowest of two iterations": lambda claims: min(our_means(claims)),
-    "highest of two iterations": lambda claims: max(our_means(claims)),
-    "lowest random yaw rate": lambda claims: min(random_yaw(claims)),
-    "highest random yaw rate": lambda claims: max(random_yaw(claims)),
+    "best episode": lambda claims: max(
+        one["best_episode"] for one in claims["experiments"].values()
+    ),
+    "probed seeds": lambda claims: claims["study3"]["seeds"],
+    "probed networks": lambda claims: claims["study3"]["networks"],
 }

@@ -11,14 +11,13 @@ import re
 import sys
 from pathlib import Path
 
-from blocks import BLOCKS, NUMBERS, forest, study_figures
+from blocks import BLOCKS, NUMBERS, study_figures
 from gallery import PICTURES
 
 from stad_lab.replication.claims import read_claims
 from stad_lab.viz.plots import to_png
 
 ROOT = Path(__file__).parent.parent
-FOREST = PICTURES / "claims.png"
 MARKED = re.compile(r"(<!-- claims: ([^>]+?) -->)(.*?)(<!-- /claims -->)", re.S)
 
 
@@ -70,7 +69,6 @@ def main() -> int:
         if not check:
             file.write_text(text, encoding="utf-8")
     if not check:
-        FOREST.write_bytes(to_png(forest(claims)))
         for name, figure in study_figures(claims).items():
             (PICTURES / f"{name}.png").write_bytes(to_png(figure))
     return int(check and bool(found))

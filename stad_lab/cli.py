@@ -193,7 +193,7 @@ def fine_tune(
     processes: int = 2,
     scheduler: str | None = None,
 ) -> None:
-    """Continue CMA-ES from a run's C, with several tracks for each agent, against rare failures.
+    """Continue CMA-ES from a run's C, with more tracks for each candidate, against rare failures.
 
     Stop it when you like; the same command continues.
 

@@ -110,9 +110,9 @@ class EvolutionConfig:
     generations: int = 55
     """Generations of CMA-ES; a finished run may be continued with more."""
     population: int = 64
-    """Agents in a generation."""
+    """Candidates in a generation."""
     tracks: int = 1
-    """Tracks that each agent drives in a generation, the same for all agents."""
+    """Tracks that each candidate drives in a generation, the same for all."""
     replay_share: float = 0.0
     """Share of the tracks that are hard earlier ones instead of new ones."""
     sigma: float = 0.1
@@ -120,9 +120,9 @@ class EvolutionConfig:
     sigma_decay: float = 0.97
     """Factor on the step size in each generation; 0 leaves the step size to CMA-ES."""
     step_size_rule: Literal["CSA", "TPA"] = "CSA"
-    """How CMA-ES adapts sigma: cumulative path length (World Models) or two-point adaptation."""
+    """How CMA-ES adapts sigma: cumulative step-size adaptation (World Models) or two-point."""
     components: int = 48
-    """Search along so many principal components of z and h; 0 for along every weight of C."""
+    """Optimise along so many principal components of z and h; 0 for every weight of C."""
     features: Literal["z, h", "z", "h"] = "z, h"
     """What C sees."""
     initial_gas: float = -0.5

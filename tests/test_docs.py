@@ -95,7 +95,15 @@ def site(tmp_path_factory):
 def test_no_page_is_stale():
     claims = read_claims()
     assert not renew.stale(claims), "run: python docs/renew.py"
-    assert Image.open(renew.FOREST).text["Description"] in PAGES["README.md"].read_text("utf-8")
+    for name, figure in blocks.study_figures(claims).items():
+        picture = Image.open(gallery.PICTURES / f"{name}.png")
+        assert picture.text["Description"] == figure.get_label(), "run: python docs/renew.py"
+
+
+def test_the_finding_has_at_most_120_words():
+    text = PAGES["README.md"].read_text(encoding="utf-8")
+    found = re.search(r"## Do difference images help\?\n(.*?)\n## ", text, re.S)[1]
+    assert len(re.sub(r"<!--.*?-->|!\[[^\]]*\]\([^)]*\)", "", found, flags=re.S).split()) <= 120
 
 
 def test_a_marker_takes_a_number_by_its_path_and_format():

@@ -1,4 +1,4 @@
-"""Record the data of the live page *The price of a nat*: V with eight KL weights.
+"""Record the data of the live page *The KL weight*: V with eight KL weights.
 
     python docs/live/record_nat.py --work runs/nat
 

@@ -34,54 +34,16 @@ def describe_tail(returns: np.ndarray) -> dict:
 def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     """95% interval of the mean of returns (seeds, tracks), resampling seeds and tracks.
 
-    A track is drawn for all seeds together. With fewer than five seeds the interval is too narrow;
-    with one it holds the variance between tracks alone. Of paired differences, it is an interval
-    of the mean difference.
+    A track is drawn for all seeds together. With few seeds the interval is too narrow: where the
+    variance lies between seeds, it covers the mean in 91% of studies with twelve, and in 85% with
+    five. With one seed it holds the variance between tracks alone.
     """
-    return middle_95(resampled_means(returns, *draw_tracks(returns, resamples)))
-
-
-def bootstrap_difference(before: np.ndarray, after: np.ndarray) -> list[float]:
-    """95% interval of mean(after) - mean(before): seeds drawn for each, tracks once for both."""
-    rng, tracks = draw_tracks(before, RESAMPLES)
-    return middle_95(resampled_means(after, rng, tracks) - resampled_means(before, rng, tracks))
-
-
-def draw_tracks(returns: np.ndarray, resamples: int) -> tuple[np.random.Generator, np.ndarray]:
-    """The Generator of a bootstrap, and the tracks of each resample, int (resamples, 1, tracks)."""
-    rng, tracks = np.random.default_rng(0), returns.shape[1]
-    return rng, rng.integers(tracks, size=(resamples, 1, tracks))
-
-
-def resampled_means(
-    returns: np.ndarray, rng: np.random.Generator, tracks: np.ndarray
-) -> np.ndarray:
-    """The mean return of each resample, float64 (resamples,); seeds are drawn here."""
-    seeds = rng.integers(len(returns), size=(len(tracks), len(returns), 1))
-    rows = [slice(start, start + CHUNK) for start in range(0, len(tracks), CHUNK)]
-    return np.concatenate([returns[seeds[own], tracks[own]].mean(axis=(1, 2)) for own in rows])
-
-
-def middle_95(samples: np.ndarray) -> list[float]:
-    """The 2.5th and the 97.5th percentile of samples, float (n,)."""
-    return [float(bound) for bound in np.percentile(samples, [2.5, 97.5])]
-
-
-def welch_p(one: Sequence[float], other: Sequence[float]) -> float:
-    """Two-sided p-value of Welch's t-test for the means of two groups of runs."""
-    return float(stats.ttest_ind(one, other, equal_var=False).pvalue)
-
-
-def pooled_interval(groups: Sequence[Sequence[float]], before: int, after: int) -> list[float]:
-    """95% interval of mean(groups[after]) - mean(groups[before]), by Student's t.
-
-    The variance within groups is pooled over all of them: two runs alone estimate it poorly.
-    """
-    free = sum(len(group) - 1 for group in groups)
-    variance = sum(np.var(group) * len(group) for group in groups) / free
-    error = np.sqrt(variance * (1 / len(groups[before]) + 1 / len(groups[after])))
-    difference = np.mean(groups[after]) - np.mean(groups[before])
-    return [float(difference + t * error) for t in stats.t.ppf([0.025, 0.975], free)]
+    rng, (seeds, tracks) = np.random.default_rng(0), returns.shape
+    columns = rng.integers(tracks, size=(resamples, 1, tracks))
+    rows = rng.integers(seeds, size=(resamples, seeds, 1))
+    parts = [slice(start, start + CHUNK) for start in range(0, resamples, CHUNK)]
+    means = [returns[rows[own], columns[own]].mean(axis=(1, 2)) for own in parts]
+    return [float(bound) for bound in np.percentile(np.concatenate(means), [2.5, 97.5])]
 
 
 def paired_p(differences: Sequence[float]) -> float:

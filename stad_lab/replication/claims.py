@@ -11,7 +11,6 @@ import numpy as np
 import pandas
 
 from stad_lab.agent import PRETRAINED
-from stad_lab.config import VARIANTS
 from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
 from stad_lab.replication import measurements, study_claims, tables
@@ -22,27 +21,20 @@ CLAIMS = tables.DATA / "claims.json"
 PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # on CarRacing-v0
 PAPER_BEST_AGENT = 929.82  # the highest point of its figures
 WORLD_MODELS = {25600: 823.0, 51200: 867.0, 204800: 880.0, 1843200: 900.5}  # episodes -> score
-COMPARED = ("paper", "two_iterations", "fine_tuned", "no_bar")  # recipes with several runs
-BASELINE_PASSES = 780  # points of `frame` from which a recipe can test the claim
 
 
 def compute_claims() -> dict[str, dict]:
     """All statistics as plain numbers: section -> name -> statistics."""
     episodes, runs, generations = tables.episodes(), tables.read("runs"), tables.read("generations")
-    probe, returns = tables.read("probe"), tables.returns_of(episodes)
-    made = [name for name in (*BASELINE_DRIVERS, *EXPERIMENTS) if name in returns]
+    made = [name for name in (*BASELINE_DRIVERS, *EXPERIMENTS) if name in set(episodes.experiment)]
     trained = [name for name in made if name in set(runs.query("role == 'world_model'").experiment)]
-    recipes = {name: compare_recipe(returns, name) for name in COMPARED}
     return {
-        "verdict": find_verdict(recipes, float(episodes["return"].max())),
         "study1": study_claims.describe_study1(),
         "study3": study_claims.describe_study3(),
         "agents": describe_agents(),
-        "recipes": recipes,
         "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
         "final_sigma": final_sigma(generations),
-        "yaw_rate_of_z": measurements.yaw_rate_of_z(probe),
-        "probe": measurements.describe_probe(probe),
+        "probe": measurements.describe_probe(tables.read("probe")),
         "models": measurements.describe_models(tables.read("model_metrics")),
         "stage_minutes": {name: measurements.stage_minutes(runs, name) for name in trained},
         "speed": measurements.describe_speed(tables.read("speed")),
@@ -58,56 +50,11 @@ def describe_experiment(name: str, episodes: pandas.DataFrame, runs: pandas.Data
         "about": planned.about if planned else BASELINE_DRIVERS[name],
         "world_models": len(run[["vae", "mdn_rnn"]].dropna().drop_duplicates()),
         "mean": float(returns.mean()),
+        "best_episode": float(returns.max()),
         "below_800": float((returns < statistics.FAILED).mean()),
         "above_900": float((returns > statistics.SOLVED).mean()),
         "runs": returns.mean(axis=1).tolist(),
         **{unit: float(run[f"total.{unit}"].mean()) for unit in tables.UNITS},
-    }
-
-
-def compare_recipe(returns: dict[str, np.ndarray], recipe: str) -> dict:
-    """The four variants of a recipe, and the difference of three of them to `frame`.
-
-    "interval" is Student's t of the run means, the variance pooled over all four variants.
-    """
-    scores = [returns[f"{recipe}_{variant}"] for variant in VARIANTS]
-    runs = [own.mean(axis=1) for own in scores]
-    found = {}
-    for place, (variant, own) in enumerate(zip(VARIANTS, scores, strict=True)):
-        found[variant] = {"mean": float(own.mean()), "runs": runs[place].tolist()}
-        if variant != "frame":
-            found[variant] |= {
-                "difference": float(own.mean() - scores[0].mean()),
-                "interval": statistics.pooled_interval(runs, 0, place),
-                "welch_p": statistics.welch_p(runs[0], runs[place]),
-            }
-    return found
-
-
-def find_verdict(recipes: dict, best_episode: float) -> dict:
-    """Whether `input_output` beats `frame` as the paper says, with the reasons.
-
-    A recipe can test the claim if `frame` reaches BASELINE_PASSES and our best episode leaves room
-    for the paper's gain. It supports the claim if the interval of the difference is above 0, and
-    contradicts it if the interval is below that gain. If recipes disagree, the claim is open.
-    """
-    gain, found = PAPER["input_output"] - PAPER["frame"], {}
-    for name, recipe in recipes.items():
-        frame, compared = recipe["frame"]["mean"], recipe["input_output"]
-        low, high = compared["interval"]
-        reached, room = frame >= BASELINE_PASSES, best_episode - frame
-        outcome = "supported" if low > 0 else "contradicted" if high < gain else "open"
-        found[name] = {
-            **{"frame": frame, "baseline_passes": reached},
-            **{"room": room, "has_room": room >= gain},
-            **{"difference": compared["difference"], "interval": compared["interval"]},
-            "outcome": outcome if reached and room >= gain else "cannot test",
-        }
-    outcomes = {recipe["outcome"] for recipe in found.values()} - {"cannot test"}
-    return {
-        "word": outcomes.pop() if len(outcomes) == 1 else "open",
-        **{"claimed_gain": gain, "best_episode": best_episode},
-        **found,
     }
 
 

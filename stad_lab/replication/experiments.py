@@ -1,7 +1,7 @@
 """The experiments of the replication: a configuration (with its variant) and some seeds each.
 
-Those that we report used pycma 4.5, which adapts sigma by two points (TPA) from 300 searched
-dimensions on, and by cumulative path length (CSA) below; the configurations state which.
+Those that we report used pycma 4.5, which adapts sigma by two points (TPA) from 300
+dimensions on, and by cumulative step-size adaptation (CSA) below; the configurations state which.
 """
 
 import dataclasses
@@ -16,7 +16,7 @@ BASELINE_DRIVERS = {  # they do not see the road, and have no seeds
     "constant_driver": "straight on with little gas, as the first controller of CMA-ES",
 }
 RECIPES = {  # each is run with all four variants, as the experiments RECIPE_VARIANT
-    "paper": "the paper's recipe, one episode per agent",
+    "paper": "the paper's budget, one episode for each candidate",
     "two_iterations": "two iterations of the world model",
     "fine_tuned": "two iterations and fine-tuning",
     "first_iteration": "the first of the two iterations",
@@ -48,7 +48,7 @@ CHANGES = {
         "h_only": ("C sees h alone", {"evolution": {"features": "h"}}),
         "untrained_mdn_rnn": ("M is not trained", {"mdn_rnn": {"steps": 0}}),
         "small_population": (
-            "16 agents on 4 tracks each", {"evolution": {"population": 16, "tracks": 4}}
+            "16 candidates on 4 tracks each", {"evolution": {"population": 16, "tracks": 4}}
         ),
     },
     "another_seed": {
@@ -56,7 +56,7 @@ CHANGES = {
             "the last CMA mean, not an average", {"evolution": {"averaged_share": 0.0}}
         ),
         "all_weights": (
-            "all weights searched", {"evolution": {"components": 0, "step_size_rule": "TPA"}}
+            "all weights optimised", {"evolution": {"components": 0, "step_size_rule": "TPA"}}
         ),
         "adaptive_sigma": ("step size adapted by CMA-ES", {"evolution": {"sigma_decay": 0.0}}),
     },

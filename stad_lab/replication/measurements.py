@@ -8,25 +8,11 @@ from collections import defaultdict
 import numpy as np
 import pandas
 
-from stad_lab.config import VARIANTS
 from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.replication.tables import key
 
 # Conditions of `speed` with which the others of their measure are compared.
 REFERENCES = ("Gymnasium", "V + M + C, 1 thread", "stad_lab")
-
-
-def yaw_rate_of_z(probe: pandas.DataFrame) -> dict:
-    """R2 of the yaw rate from z, under the agent, for each V that was trained without the bar."""
-    asked = probe.query("driver == 'agent' and features == 'z' and quantity == 'yaw rate'")
-    asked = asked[asked.trained & ~asked.indicator_bar]
-    asked = asked[~asked.world_model.str.startswith("shorter_")]  # trained for fewer steps
-    values = {variant: sorted(asked.r2[asked.variant == variant]) for variant in VARIANTS}
-    values["others"] = sorted(asked.r2[asked.variant != "input_output"])
-    return {
-        name: {"trainings": len(r2), "lowest": r2[0], "highest": r2[-1], "values": r2}
-        for name, r2 in values.items()
-    }
 
 
 def describe_probe(probe: pandas.DataFrame) -> dict:

@@ -139,9 +139,14 @@ def run_study(
     left to it, so several processes may run a study in the same folder. With `only`, pipelines that
     the tables have are run, too, and compared with the tables instead of added.
 
-    Raises ValueError as `find_pipelines`, and what `train` raises.
+    Raises ValueError as `find_pipelines`, and for a folder with a recorded pipeline that `only`
+    names; and what `train` raises.
     """
     wanted, root = find_pipelines(study, seeds, only), Path(folder) / study
+    for pipeline in wanted if only else ():
+        if (root / pipeline.name / SCORE).exists() and recorded(pipeline, to):
+            remedy = "give an empty folder with --out to repeat it"
+            raise ValueError(f"{root / pipeline.name} is the recorded pipeline: {remedy}")
     for seed, variant in dict.fromkeys((one.seed, one.variant) for one in wanted):
         own = [one for one in wanted if (one.seed, one.variant) == (seed, variant)]
         if not only and not unfinished(own, to):
@@ -348,7 +353,9 @@ def compare(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> str:
     if not differs and not other:
         return f"bit-identical to the recorded one, all {len(again)} returns, too"
     made = [
-        f"{line['processor']}, V and M on {line['world_model.trained_on']}" for line in (was, now)
+        f"{line['processor']}, V and M on {line['world_model.trained_on']} with PyTorch"
+        f" {line['world_model.torch']}"
+        for line in (was, now)
     ]
     found = f"differs in {', '.join(differs)} and {other} of {len(again)} returns"
     return f"{found}; recorded on {made[0]}, here {made[1]}"

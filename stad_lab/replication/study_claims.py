@@ -90,7 +90,8 @@ def compare_family(
         one["holm_p"] = p
         one["verdict"] = find_verdict(one["interval"], p)
         deviation = float(np.std(one["by_seed"], ddof=1))
-        seeds = statistics.pairs_that_decide(deviation, MARGIN, len(found))
+        more = len(one["by_seed"]) + 1  # the t-test might have decided with fewer
+        seeds = max(more, statistics.pairs_that_decide(deviation, MARGIN, len(found)))
         one |= {"deviation": deviation, "seeds_that_decide": seeds}
     return found
 

@@ -199,7 +199,7 @@ def ask(strategy: "Strategy", settings: EvolutionConfig, generation: int) -> np.
 
 
 def tell(strategy: "Strategy", population: np.ndarray, returns: list, means: list) -> None:
-    """Tell CMA-ES, which minimises, each agent's returns on its tracks; appends to the means."""
+    """Tell CMA-ES, which minimises, the candidates' returns; appends to the means."""
     strategy.tell(population, [-np.mean(own) for own in returns])
     means.append(strategy.mean.copy())
 

@@ -1,4 +1,4 @@
-"""Fine-tuning: CMA-ES continues from a finished C, with more tracks for each agent.
+"""Fine-tuning: CMA-ES continues from a finished C, with more tracks for each candidate.
 
 CMA-ES ranks its candidates. Where each drives one track in a generation, the fastest lead, and a
 failure on one track in twenty rarely counts. In the fine-tuning stage each drives eight tracks, and

@@ -1,4 +1,4 @@
-"""The figures of the replication: of the earlier recipes, and of the studies of the protocol."""
+"""The figures of the studies that docs/protocol.md fixes."""
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -16,79 +16,12 @@ from stad_lab.viz.plots import (
     plot_intervals,
 )
 
-CONDITIONS = {
-    "paper": "1. Paper's recipe, indicator bar cropped",
-    "no_bar": "2. One iteration, indicator bar cropped",
-    "two_iterations": "3. Two iterations, indicator bar visible",
-    "fine_tuned": "4. As 3 with fine-tuning",
-}
 COLOURS = {"frame": "#555555", "input": BLUE, "output": RED, "input_output": GREEN}
 SEEN = {"z": "C sees z", "z, h": "C sees z and h"}
+DRIVERS = {"agent": "an agent", "random_driver": "the random driver"}
 SOURCES = {"z": "z", "z, h": "z and h"}
 TURNING = ("slip speed", "yaw rate", "wheel angle")  # what a single frame does not show
 PAPER_LEAD = 75  # of `input_output`, the smallest of the three that the paper reports
-
-
-def plot_forest(recipes: dict[str, dict[str, dict]], best_episode: float) -> Figure:
-    """For each condition and variant: the runs less the mean of `frame`, and the 95% interval.
-
-    Args:
-        recipes: condition -> variant -> "mean", "runs" and, but for `frame`, "difference" and
-            "interval", in points.
-        best_episode: the highest return of any episode; a mean cannot lie above it.
-    """
-    figure, axes = new_figure(8.0, 7.2, len(CONDITIONS))
-    axes, described = axes[:, 0], []
-    for axis, (condition, title) in zip(axes, CONDITIONS.items(), strict=True):
-        found = recipes[condition]
-        base = found["frame"]["mean"]
-        axis.set_title(f"{title} (frame: {base:.0f} points)", loc="left", fontsize=10)
-        plot_condition(axis, found)
-        others = [f"{name} {difference_of(found[name])}" for name in COLOURS if name != "frame"]
-        panel = title.replace("indicator ", "")
-        described += [f"{panel}, frame {base:.0f}: " + ", ".join(others) + "."]
-    ends = [end for axis in axes[1:] for end in axis.get_xlim()]
-    for axis in axes[1:]:
-        axis.set_xlim(min(ends), max(ends))
-    for axis, condition in zip(axes, CONDITIONS, strict=True):
-        shade_from(axis, best_episode - recipes[condition]["frame"]["mean"])
-    axes[-1].set_xlabel("Difference of the mean return to frame, points")
-    figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    figure.set_label(
-        "Mean return less that of frame, with 95% intervals; the paper reports"
-        f" +{PAPER_LEAD}. " + " ".join(described)
-    )
-    return figure
-
-
-def plot_condition(axis: Axes, found: dict[str, dict]) -> None:
-    """One line for each variant, from the top, in one condition."""
-    base = found["frame"]["mean"]
-    axis.axvline(0, color="black", linewidth=0.8)
-    axis.axvline(PAPER_LEAD, color="black", linestyle="--", label=f"paper: +{PAPER_LEAD}")
-    for height, (variant, colour) in enumerate(COLOURS.items()):
-        one = found[variant]
-        if "interval" in one:
-            label = "mean, 95% interval" if variant == "input" else None
-            axis.plot(one["interval"], [height] * 2, color=colour, linewidth=2.5, label=label)
-            axis.plot(one["difference"], height, "D", color=colour, markersize=7)
-        runs = [run - base for run in one["runs"]]
-        label = "one run" if variant == "frame" else None
-        style = {"markerfacecolor": "white", "markeredgecolor": colour, "linestyle": "none"}
-        axis.plot(runs, [height + 0.25] * len(runs), "o", markersize=5, label=label, **style)
-    axis.set_yticks(range(len(COLOURS)), list(COLOURS))
-    axis.set_ylim(len(COLOURS) - 0.4, -0.5)
-    axis.grid(axis="x", color="#dddddd")
-    axis.set_axisbelow(True)
-
-
-def shade_from(axis: Axes, start: float) -> None:
-    """Shade the differences that would need a mean above our best episode."""
-    low, high = axis.get_xlim()
-    if start < high:
-        label = "above our best episode"
-        axis.axvspan(start, high, color="#eeeeee", zorder=0, label=label)
-    axis.set_xlim(low, high)
 
 
 def difference_of(one: dict) -> str:
@@ -187,6 +120,7 @@ def plot_representation(study3: dict, driver: str = "agent") -> Figure:
         for quantity in next(iter(rows.values()))["z"]
     }
     title = f"Study 3: what {study3['networks']} V networks carry, a line for each"
+    title += f" ({DRIVERS[driver]} drives)"
     figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
     told = [
         f"{quantity} of {row} {panels[quantity][row]['from z'][0]:.2f}"

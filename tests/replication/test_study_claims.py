@@ -164,23 +164,27 @@ def test_nothing_is_tested_before_the_last_pipeline_is_there(full, tmp_path):
     assert describe_study1(tmp_path / "empty")["pipelines"] == 0
 
 
-def test_the_page_has_the_progress_until_the_last_seed_and_then_every_result(found):
+def test_the_pages_have_the_progress_until_the_last_seed_and_then_every_result(found):
     study3 = {"seeds": 0, "planned_seeds": 12, "networks": 0}
     progress = {"complete_seeds": 3, "planned_seeds": 12, "pipelines": 29, "planned_pipelines": 96}
     claims = {"study1": progress | {"trained_on": {"cpu": 8, "cuda": 7}}, "study3": study3}
-    page = blocks.study1(claims)
-    assert "3 of 12 seeds are complete" in page and "7 of 15 V networks" in page
+    for block in (blocks.verdict, blocks.gains):
+        assert "3 of 12 seeds are complete" in block(claims)
+    assert blocks.on_gpu(claims) == "7 of 15" and blocks.verdict_figure(claims) == ""
+    assert "|" not in blocks.study1(claims) + blocks.outcomes(claims)
     assert not blocks.study_figures(claims)
     claims["study1"] = found
     page = blocks.study1(claims)
     for name, one in found["comparisons"].items():
         features, variant = name.split(": ")
-        line = next(
-            line for line in page.splitlines() if f"`{variant}`, {blocks.SEEN[features]} |" in line
-        )
-        assert blocks.difference_of(one) in line and blocks.p_value(one["holm_p"]) in line
-        assert f"| {one['verdict']} |" in line
-    assert page.count("](../notebooks/pictures/study1") == len(blocks.study_figures(claims)) == 2
+        start = f"`{variant}`, {blocks.SEEN[features]} |"
+        line = next(line for line in page.splitlines() if start in line)
+        p = blocks.format_p(one["holm_p"]).removeprefix("= ")
+        assert blocks.difference_of(one) in line and f"| {p} | {one['verdict']} |" in line
+    assert "C sees z" in blocks.gains(claims) and blocks.verdict(claims).count("\n- ") == 4
+    assert "](../notebooks/pictures/study1.png)" in page
+    assert "](notebooks/pictures/study1.png)" in blocks.verdict_figure(claims)
+    assert "](../notebooks/pictures/study1_curves.png)" in blocks.outcomes(claims)
 
 
 def test_a_pipeline_without_all_its_episodes_is_refused(full, tmp_path):

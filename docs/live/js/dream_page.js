@@ -106,7 +106,7 @@ stad.start(async () => {
     const over = dream && from + dream.frames >= drive.length;
     set("t", `${t}${over ? ", the recording has ended" : ""}`);
     set("dream-name", dream ? "The dream" : memory?.latents[t] ? "Reconstruction" : "Seen");
-    const open = waiting ? "M is reading the drive up to this frame." : "The eyes are open.";
+    const open = waiting ? "M is processing the episode up to this frame." : "The eyes are open.";
     set("dream-note", dream ? `frame ${dream.frames}, ${wheel}` : open);
     set("eyes", dream ? "Open the eyes" : waiting ? "Keep them open" : "Close the eyes here");
     set("scrub-value", String(t));

@@ -1,5 +1,5 @@
 "use strict";
-// The page "The price of a nat": what V reconstructs along the rate-distortion curve.
+// The page "The KL weight": what V reconstructs along the rate-distortion curve.
 
 stad.start(async () => {
   const { networks: found, frames } = await stad.load("nat"); // in order of their KL weights
