@@ -20,6 +20,7 @@ from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.io.dask_cluster import check_address, check_versions, cluster, versions
 from stad_lab.io.files import load_json
 from stad_lab.io.workers import TaskError, run_tasks
+from stad_lab.replication.study import STUDIES, Study, evaluate_kept, run_study
 from stad_lab.training.dataset import collect
 from stad_lab.training.evolution import LOG, evolve
 
@@ -125,6 +126,25 @@ def test_the_command_line_runs_an_experiment_on_a_cluster(scheduler, tmp_path, m
         episodes.append(load_json(result)["episodes"])
     assert len(episodes[0]) == 3 and episodes[0] == episodes[1]
     assert "constant_driver: " in capsys.readouterr().out
+
+
+def test_the_command_line_runs_a_study_on_a_cluster(scheduler, tmp_path, monkeypatch, capsys):
+    evolution = {"generations": 2, "max_frames": 20, "components": 4}
+    config = QUICK.replace(vae={"steps": 4}, mdn_rnn={"steps": 2}, evolution=evolution)
+    brief = Study("one pipeline", (0,), ("input_output",), ("z, h",), config, range(1000, 1003), 20)
+    monkeypatch.setitem(STUDIES, "brief", brief)
+    monkeypatch.setattr(run_study, "__defaults__", (None, None, None, tmp_path / "data"))
+    monkeypatch.setattr(evaluate_kept, "__defaults__", (None, None, tmp_path / "networks", None))
+    name, far, episodes = "seed0/input_output/z_h", ["--scheduler", scheduler[0]], []
+    assert main(["replicate", "brief", "--out", str(tmp_path / "far"), *far]) == 0
+    assert main(["replicate", "brief", "--only", name, "--out", str(tmp_path / "near")]) == 0
+    assert f"{name}: bit-identical to the recorded one, all 3 returns" in capsys.readouterr().out
+    for where in (far, []):
+        scores = tmp_path / f"{len(episodes)}.json"
+        drive = ["evaluate-study", "brief", "--first-track", "7", "--episodes", "2"]
+        assert main([*drive, "--json", str(scores), *where]) == 0
+        episodes.append(load_json(scores)["agents"][name]["episodes"])
+    assert len(episodes[0]) == 2 and episodes[0] == episodes[1]
 
 
 def test_a_worker_killed_in_the_middle_of_a_generation_costs_a_retry_and_not_the_run(
