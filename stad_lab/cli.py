@@ -227,7 +227,7 @@ def evaluate(
     json: Path | None = None,
     scheduler: str | None = None,
 ) -> None:
-    """Drive an agent on unseen tracks; prints mean, deviation, interval and share above 900.
+    """Drive an agent on test tracks; prints mean, deviation, interval and share above 900.
 
     Stop it when you like; the same command continues.
 
@@ -327,7 +327,7 @@ def evaluate_study(
 ) -> None:
     """Drive the kept agents of a study on any tracks, with the fast renderer.
 
-    The tracks of the study's own score give its returns again, to the last bit on the same kind of
+    The tracks of the study's own score give its returns again, bit-identical on the same kind of
     processor.
 
     Args:

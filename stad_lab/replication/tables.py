@@ -69,7 +69,7 @@ def read_study(name: str, folder: Path = DATA) -> pandas.DataFrame:
 
 
 def episodes(folder: Path = DATA) -> pandas.DataFrame:
-    """The evaluation of each run: `return` and `frames` on every official track."""
+    """The evaluation of each run: `return` and `frames` on every test track."""
     table = read("episodes", folder)
     for (experiment, seed), run in table.groupby(["experiment", "seed"]):
         check_tracks(f"{experiment}, seed {seed}", run["track"])
@@ -77,7 +77,7 @@ def episodes(folder: Path = DATA) -> pandas.DataFrame:
 
 
 def check_tracks(name: str, tracks) -> None:
-    """Raise ValueError unless an evaluation drives every official track once."""
+    """Raise ValueError unless an evaluation drives every test track once."""
     if sorted(tracks) != list(range(TRACKS)):
         raise ValueError(f"{name}: expected one episode on each of the tracks 0 to {TRACKS - 1}")
 
