@@ -15,7 +15,7 @@ from PIL import Image
 from stad_lab import cli, config
 from stad_lab.replication.claims import PAPER
 from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
-from stad_lab.replication.verdict import describe_verdict, format_p
+from stad_lab.replication.verdict import PAPER_GAIN, describe_verdict
 from stad_lab.viz.replication import (
     SEEN,
     SOURCES,
@@ -66,9 +66,9 @@ def finding(claims: dict) -> str:
     others = max(value for name in config.VARIANTS[:3] for value in yaw[name])
     told = " ".join(describe_verdict(claims["study1"])[:3])
     return (
-        f"{told}\n\nWhat replicates is in the latents: while an agent drives, only z of"
-        " `input_output` carries the yaw rate, how fast the car turns (R2 at least"
-        f" {min(yaw['input_output']):.2f}, others at most {others:.2f})."
+        f"{told}\n\nThe latents differ clearly: only z of `input_output` carries the yaw rate,"
+        f" how fast the car turns (R2 at least {min(yaw['input_output']):.2f}, others at most"
+        f" {others:.2f})."
     )
 
 
@@ -86,11 +86,11 @@ def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
     if "comparisons" not in (found := claims["study1"]):
         return describe_verdict(found)[0]
-    told = [
-        f"{difference_of(found['comparisons'][f'{features}: input_output'])} points if {seen}"
-        for features, seen in SEEN.items()
-    ]
-    return f"In our study `input_output` differs from `frame` by {' and '.join(told)}."
+    alone, both = (
+        difference_of(found["comparisons"][f"{features}: input_output"]) for features in FEATURES
+    )
+    told = f"With difference images the score changes by {alone} points without M's memory and by"
+    return f"{told} {both} points with it (95% intervals)."
 
 
 def verdict_figure(claims: dict) -> str:
@@ -113,17 +113,10 @@ def outcomes(claims: dict) -> str:
     if "comparisons" not in found:
         return "They appear here when the last seed is complete."
     leads = [f"{area_of(found, f, 'input_output')} if {seen}" for f, seen in SEEN.items()]
-    told = "Faster learning: over the curve `input_output` leads `frame` by"
-    told += f" {' and by '.join(leads)}, in points of the validation mean (95% intervals)."
+    told = "Faster learning: over the curve, the validation mean of `input_output` less that of"
+    told += f" `frame` is {' and '.join(leads)} (95% intervals)."
     curves = image("study1_curves", study_figures(claims))
     return "\n\n".join([told, outcomes_table(found), curves])
-
-
-def on_gpu(claims: dict) -> str:
-    """How many V networks were trained on a GPU."""
-    trained = claims["study1"]["trained_on"]
-    count = sum(number for name, number in trained.items() if name != "cpu")
-    return f"{count} of {sum(trained.values())}"
 
 
 def comparisons_table(study: dict) -> str:
@@ -134,7 +127,7 @@ def comparisons_table(study: dict) -> str:
             arm = f"{features}: {variant}"
             one, arms = study["comparisons"][arm], study["arms"]
             means = [f"{arms[name]['mean']:.0f}" for name in (f"{features}: frame", arm)]
-            p = [format_p(one[key]).removeprefix("= ") for key in ("p", "holm_p")]
+            p = [p_value(one[key]) for key in ("p", "holm_p")]
             outcome = one["verdict"]
             if outcome == "undecided":
                 outcome += f": {one['seeds_that_decide']} seeds would decide"
@@ -143,8 +136,14 @@ def comparisons_table(study: dict) -> str:
             scatter = f"{one['deviation']:.0f}"
             cells = (family, name, pipelines, *means, difference_of(one), scatter, *p, outcome)
             lines.append(cells)
-    head = ("test", "variant", "pairs", "`frame`", "variant", "difference (95% interval)")
+    head = ("test", "arm", "pairs", "mean of `frame`", "mean of the arm")
+    head += ("difference (95% interval)",)
     return table((*head, "SD of pairs", "p", "Holm's p", "verdict"), lines)
+
+
+def p_value(p: float) -> str:
+    """Three decimals, or that it is smaller."""
+    return f"{p:.3f}" if p >= 0.001 else "< 0.001"
 
 
 def outcomes_table(study: dict) -> str:
@@ -158,7 +157,8 @@ def outcomes_table(study: dict) -> str:
         name = f"`{variant}`, {SEEN[features]}"
         lines.append((name, f"{one['below_800']:.1%}", *scores, lead))
     head = ("arm", "below 800", "interquartile mean", "10th percentile", "minimum")
-    return table((*head, "area under the learning curve", "less `frame`"), lines)
+    area = "area under the learning curve"
+    return table((*head, area, "difference of the area to `frame` (95% interval)"), lines)
 
 
 def area_of(study: dict, features: str, variant: str) -> str:
@@ -203,7 +203,7 @@ def study_figures(claims: dict) -> dict:
     """The figures of the studies for which there is data: name of the file -> Figure."""
     one, three, figures = claims["study1"], claims["study3"], {}
     if "comparisons" in one:
-        figures["study1"] = plot_study(one["comparisons"], MARGIN)
+        figures["study1"] = plot_study(one["comparisons"], MARGIN, PAPER_GAIN)
         figures["study1_curves"] = plot_learning_curves(one["curves"])
     if three["seeds"] > 1:
         figures["study3"] = plot_representation(three)
@@ -234,24 +234,18 @@ def experiments_table(claims: dict) -> str:
 
 
 def r2(claims: dict, driver: str, world_model: str, features: str = "z") -> dict[str, float]:
-    """R2 of the probe: quantity -> value; empty if it was not measured."""
-    return claims["probe"][f"{driver}: {world_model}"].get(features, {})
+    """R2 of the probe: quantity -> value."""
+    return claims["probe"][f"{driver}: {world_model}"][features]
 
 
 def bar_table(claims: dict) -> str:
     """R2 of one training of each variant with the indicator bar, while the agent drives."""
-    lines = [probe_line(claims, "agent", one, f"`{one}`") for one in config.VARIANTS]
+    lines = []
+    for variant in config.VARIANTS:
+        alone, both = (r2(claims, "agent", f"{variant}-0", features) for features in FEATURES)
+        cells = [f"{fixed(alone[one])} ({fixed(both[one])})" for one in QUANTITIES]
+        lines.append((f"`{variant}`", *cells))
     return table(("V", *QUANTITIES), lines)
-
-
-def probe_line(claims: dict, driver: str, world_model: str, title: str) -> tuple[str, ...]:
-    """One line of `latents_table`."""
-    alone = r2(claims, driver, f"{world_model}-0")
-    both = r2(claims, driver, f"{world_model}-0", "z, h")
-    cells = [
-        f"{fixed(alone[one])}" + (f" ({fixed(both[one])})" if both else "") for one in QUANTITIES
-    ]
-    return (title, *cells)
 
 
 # The agents
@@ -426,7 +420,6 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "verdict": verdict,
     "gains": gains,
     "verdict's figure": verdict_figure,
-    "on gpu": on_gpu,
     "study1": study1,
     "outcomes": outcomes,
     "turning": turning_table,
@@ -460,6 +453,10 @@ BLOCKS |= {
 NUMBERS: dict[str, Callable[[dict], float]] = {
     "best episode": lambda claims: max(
         one["best_episode"] for one in claims["experiments"].values()
+    ),
+    "trained networks": lambda claims: sum(claims["study1"]["trained_on"].values()),
+    "networks of a GPU": lambda claims: sum(
+        count for name, count in claims["study1"]["trained_on"].items() if name != "cpu"
     ),
     "probed seeds": lambda claims: claims["study3"]["seeds"],
     "probed networks": lambda claims: claims["study3"]["networks"],

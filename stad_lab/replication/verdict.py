@@ -4,14 +4,17 @@ Every sentence follows from the comparisons of `stad_lab.replication.study_claim
 none of their own about the outcome.
 """
 
+from stad_lab.config import VARIANTS
+from stad_lab.replication.claims import PAPER
 from stad_lab.replication.study_claims import FEATURES, MARGIN
 
-PAPER_GAIN = 75  # points of `input_output` in the paper, the smallest of its three gains
+PAPER_GAIN = min(PAPER[name] for name in VARIANTS[1:]) - PAPER["frame"]  # the smallest
 SEES = {"z": "z alone", "z, h": "z and h"}
+ORDER = ("gain", "harm", "no relevant gain", "undecided")  # of telling
 
 
 def describe_verdict(study: dict) -> list[str]:
-    """The verdict for both C, what it means for the claim, and two remarks on the paper's gain.
+    """Four sentences: the verdict for both C, what it means, and the paper's gain beside it.
 
     While the study is running, a single sentence with its progress.
 
@@ -19,72 +22,60 @@ def describe_verdict(study: dict) -> list[str]:
         study: what `describe_study1` returns.
     """
     if "comparisons" not in study:
-        return [describe_progress(study)]
+        return [describe_running(study)]
     primary = {features: study["comparisons"][f"{features}: input_output"] for features in FEATURES}
     told = [describe_comparison(features, one) for features, one in primary.items()]
-    verdicts = {features: one["verdict"] for features, one in primary.items()}
-    return [*told, describe_meaning(verdicts), *describe_paper_gain(primary)]
+    return [*told, describe_meaning(primary), describe_paper_gain(primary)]
 
 
-def describe_progress(study: dict) -> str:
+def describe_running(study: dict) -> str:
     """How much of the study is done."""
     text = "The study is running: {complete_seeds} of {planned_seeds} seeds are complete,"
-    text += " {pipelines} of {planned_pipelines} pipelines; nothing is tested before the last."
-    return text.format(**study)
+    text += " {pipelines} of {planned_pipelines} pipelines."
+    return text.format(**study) + " Nothing is tested before the last seed is complete."
 
 
 def describe_comparison(features: str, one: dict) -> str:
-    """The verdict of one primary comparison, with its numbers."""
-    points, (low, high) = round(one["difference"]), one["interval"]
-    more = f"{abs(points)} points {'less' if points < 0 else 'more'} than `frame`"
-    text = (
-        f"If C sees {SEES[features]}, the verdict is *{one['verdict']}*: `input_output` has {more}"
-    )
-    text += f" (95% interval {low:.1f} to {high:.1f}, Holm's p {format_p(one['holm_p'])})"
-    decides = f"; {one['seeds_that_decide']} seeds would decide"
-    return text + decides * (one["verdict"] == "undecided") + "."
+    """The verdict of one primary comparison, with its interval."""
+    points, (low, high) = one["difference"], one["interval"]
+    leads = f"{'trails' if points < 0 else 'leads'} `frame` by {abs(points):.1f} points"
+    text = f"If C sees {SEES[features]}, the verdict is *{one['verdict']}*: `input_output` {leads}"
+    text += f" (95% interval {low:.1f} to {high:.1f})"
+    if one["verdict"] == "undecided":
+        text += f"; at this scatter {one['seeds_that_decide']} seeds are sure to decide"
+    return text + "."
 
 
-def format_p(p: float) -> str:
-    """Three decimals, or that it is smaller."""
-    return f"= {p:.3f}" if p >= 0.001 else "< 0.001"
-
-
-SAME = {  # what it means if both verdicts are alike
-    "gain": "So difference images raise the score here, as the paper claims.",
-    "harm": "So the claim does not replicate here: difference images lower the score.",
-    "no relevant gain": "So the claim does not replicate here:"
-    f" a gain of {MARGIN} points is excluded.",
-    "undecided": "So whether difference images raise the score stays open.",
-}
-PART = {  # and if they differ, in the order of telling
-    "gain": "difference images raise the score",
-    "harm": "difference images lower the score",
-    "no relevant gain": f"a gain of {MARGIN} points is excluded",
-    "undecided": "the question stays open",
-}
-
-
-def describe_meaning(verdicts: dict[str, str]) -> str:
+def describe_meaning(primary: dict[str, dict]) -> str:
     """What the verdicts for z, and for z and h, mean for the claim."""
-    first, second = sorted(FEATURES, key=lambda features: list(PART).index(verdicts[features]))
-    if verdicts[first] == verdicts[second]:
-        return SAME[verdicts[first]]
-    told = f"So {PART[verdicts[first]]} here if C sees {SEES[first]}"
-    return f"{told}; if it sees {SEES[second]}, {PART[verdicts[second]]}."
+    first, second = sorted(FEATURES, key=lambda one: ORDER.index(primary[one]["verdict"]))
+    effects = describe_effect(primary[first]), describe_effect(primary[second])
+    if effects[0] == effects[1]:
+        return f"So {effects[0]}, whatever C sees."
+    return f"So {effects[0]} if C sees {SEES[first]}; if it sees {SEES[second]}, {effects[1]}."
 
 
-def describe_paper_gain(primary: dict[str, dict]) -> list[str]:
-    """Where the paper's gain lies, and why no result here refutes the paper's own numbers."""
-    places = {
-        features: "below" if low > PAPER_GAIN else "above" if high < PAPER_GAIN else "within"
-        for features, (low, high) in ((name, one["interval"]) for name, one in primary.items())
-    }
-    first, second = (places[features] for features in FEATURES)
-    where = f"{first} both intervals"
-    if first != second:
-        where = f"{first} the interval for z alone and {second} that for z and h"
-    return [
-        f"The {PAPER_GAIN} points of the paper lie {where}.",
-        "They were measured on CarRacing-v0 with another recipe, so they are not refuted.",
-    ]
+def describe_effect(one: dict) -> str:
+    """What one comparison says about difference images."""
+    (low, high), small = one["interval"], f" by less than {MARGIN} points"
+    if one["verdict"] == "gain":
+        return "difference images raise the score" + small * (high < MARGIN)
+    if one["verdict"] == "harm":
+        return "difference images lower the score" + small * (low > -MARGIN)
+    excluded = f"the interval excludes a gain of {MARGIN} points"
+    if one["verdict"] == "no relevant gain":
+        return excluded
+    return "the effect of difference images stays open" + f", but {excluded}" * (high < MARGIN)
+
+
+def describe_paper_gain(primary: dict[str, dict]) -> str:
+    """Where the paper's gain lies, and why no result here tests the paper's own numbers."""
+    places = []
+    for features in FEATURES:
+        low, high = primary[features]["interval"]
+        places.append("below" if low > PAPER_GAIN else "above" if high < PAPER_GAIN else "within")
+    where = f"{places[0]} both intervals"
+    if places[0] != places[1]:
+        where = f"{places[0]} the interval for z alone and {places[1]} that for z and h"
+    text = f"The {PAPER_GAIN:.0f} points of the paper lie {where}; they were measured on"
+    return text + " CarRacing-v0 with another recipe, so our intervals do not test them."

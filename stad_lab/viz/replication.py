@@ -21,33 +21,28 @@ SEEN = {"z": "C sees z", "z, h": "C sees z and h"}
 DRIVERS = {"agent": "an agent", "random_driver": "the random driver"}
 SOURCES = {"z": "z", "z, h": "z and h"}
 TURNING = ("slip speed", "yaw rate", "wheel angle")  # what a single frame does not show
-PAPER_LEAD = 75  # of `input_output`, the smallest of the three that the paper reports
 
 
 def difference_of(one: dict) -> str:
     """A variant's difference to `frame` with its interval, as on the pages."""
     low, high = one["interval"]
-    return f"{signed(one['difference'])} ({round(low)} to {round(high)})"
+    return f"{one['difference']:+.1f} ({low:.1f} to {high:.1f})"
 
 
-def signed(number: float) -> str:
-    """A rounded number with its sign, and 0 without."""
-    return f"{round(number):+d}" if round(number) else "0"
-
-
-def plot_study(comparisons: dict[str, dict], margin: float) -> Figure:
+def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> Figure:
     """The forest plot of study 1: each pipeline less `frame` of its seed, and the mean of these.
 
     Args:
         comparisons: "FEATURES: VARIANT" -> "difference", "interval", "by_seed" and "verdict".
         margin: differences within +-margin, in points, are not relevant.
+        reported: the gain that the paper reports, in points.
     """
     variants = [variant for variant in COLOURS if variant != "frame"]
     figure, axes = new_figure(8.0, 4.6, 2, 1, sharex=True)
     for axis, (features, title) in zip(axes[:, 0], SEEN.items(), strict=True):
         axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
         axis.axvline(0, color="black", linewidth=0.8)
-        axis.axvline(PAPER_LEAD, color="black", linestyle="--", label=f"paper: +{PAPER_LEAD}")
+        axis.axvline(reported, color="black", linestyle="--", label=f"paper: {reported:+.0f}")
         for height, variant in enumerate(variants):
             plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
         name_rows(axis, variants)
@@ -74,7 +69,7 @@ def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:
     )
     axis.plot(one["difference"], height, "D", color=colour, markersize=7)
     places = [height - 0.27] * len(one["by_seed"])
-    axis.plot(one["by_seed"], places, "o", markersize=5, label="one pipeline", **seeds)
+    axis.plot(one["by_seed"], places, "o", markersize=5, label="one seed", **seeds)
 
 
 def plot_learning_curves(curves: dict[str, dict]) -> Figure:
@@ -119,11 +114,11 @@ def plot_representation(study3: dict, driver: str = "agent") -> Figure:
         }
         for quantity in next(iter(rows.values()))["z"]
     }
-    title = f"Study 3: what {study3['networks']} V networks carry, a line for each"
+    title = f"Study 3: what {study3['networks']} V networks and untrained ones carry, a line each"
     title += f" ({DRIVERS[driver]} drives)"
     figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
     told = [
-        f"{quantity} of {row} {panels[quantity][row]['from z'][0]:.2f}"
+        f"{quantity} of {row} {round(panels[quantity][row]['from z'][0], 2) + 0.0:.2f}"
         for quantity in TURNING
         for row in rows
     ]

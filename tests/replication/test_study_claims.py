@@ -170,7 +170,8 @@ def test_the_pages_have_the_progress_until_the_last_seed_and_then_every_result(f
     claims = {"study1": progress | {"trained_on": {"cpu": 8, "cuda": 7}}, "study3": study3}
     for block in (blocks.verdict, blocks.gains):
         assert "3 of 12 seeds are complete" in block(claims)
-    assert blocks.on_gpu(claims) == "7 of 15" and blocks.verdict_figure(claims) == ""
+    numbers = [blocks.NUMBERS[name](claims) for name in ("networks of a GPU", "trained networks")]
+    assert numbers == [7, 15] and blocks.verdict_figure(claims) == ""
     assert "|" not in blocks.study1(claims) + blocks.outcomes(claims)
     assert not blocks.study_figures(claims)
     claims["study1"] = found
@@ -179,9 +180,11 @@ def test_the_pages_have_the_progress_until_the_last_seed_and_then_every_result(f
         features, variant = name.split(": ")
         start = f"`{variant}`, {blocks.SEEN[features]} |"
         line = next(line for line in page.splitlines() if start in line)
-        p = blocks.format_p(one["holm_p"]).removeprefix("= ")
+        p = blocks.p_value(one["holm_p"])
         assert blocks.difference_of(one) in line and f"| {p} | {one['verdict']} |" in line
-    assert "C sees z" in blocks.gains(claims) and blocks.verdict(claims).count("\n- ") == 4
+    gain = blocks.difference_of(found["comparisons"]["z: input_output"])
+    assert f"by {gain} points without" in blocks.gains(claims)
+    assert blocks.verdict(claims).count("\n- ") == 3
     assert "](../notebooks/pictures/study1.png)" in page
     assert "](notebooks/pictures/study1.png)" in blocks.verdict_figure(claims)
     assert "](../notebooks/pictures/study1_curves.png)" in blocks.outcomes(claims)

@@ -1,58 +1,71 @@
 """The verdict in words: each outcome of the study has its sentences, and they are short."""
 
 import itertools
+import sys
+from pathlib import Path
 
 import pytest
 
+from stad_lab.config import VARIANTS
 from stad_lab.replication.study_claims import FEATURES, find_verdict
 from stad_lab.replication.verdict import describe_verdict
 
-OUTCOMES = {  # interval and Holm's p of each verdict
-    "gain": ([12.3, 80.1], 0.0004),
-    "harm": ([-50.2, -4.0], 0.012),
-    "no relevant gain": ([-29.6, 11.0], 0.3),
-    "undecided": ([-20.0, 41.0], 0.2),
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+import blocks
+
+OUTCOMES = {  # interval and Holm's p, and the effect that the meaning names
+    "gain": ([12.3, 80.1], 0.0004, "difference images raise the score"),
+    "small gain": ([4.0, 25.0], 0.01, "raise the score by less than 30 points"),
+    "harm": ([-50.2, -4.0], 0.012, "difference images lower the score"),
+    "small harm": ([-25.5, -4.0], 0.012, "lower the score by less than 30 points"),
+    "no relevant gain": ([-29.6, 11.0], 0.3, "the interval excludes a gain of 30 points"),
+    "undecided": ([-20.0, 41.0], 0.2, "the effect of difference images stays open"),
+    "undecided, no gain": ([-45.0, 20.0], 0.2, "stays open, but the interval excludes a gain"),
 }
+PAIRS = list(itertools.product(OUTCOMES, repeat=2))
 
 
 def study_with(words):
     """A finished study with these verdicts for z, and for z and h."""
     comparisons = {}
     for features, word in zip(FEATURES, words, strict=True):
-        interval, p = OUTCOMES[word]
+        interval, p, _ = OUTCOMES[word]
         found = {"difference": sum(interval) / 2, "interval": interval, "holm_p": p}
-        found |= {"verdict": find_verdict(interval, p), "seeds_that_decide": 21}
+        found |= {"verdict": find_verdict(interval, p), "seeds_that_decide": 121}
         comparisons[f"{features}: input_output"] = found
     return {"comparisons": comparisons}
 
 
-@pytest.mark.parametrize("words", itertools.product(OUTCOMES, repeat=2))
+@pytest.mark.parametrize("words", PAIRS)
 def test_every_pair_of_verdicts_has_a_meaning_for_the_claim(words):
-    alone, both, meaning, *_ = told = describe_verdict(study_with(words))
+    alone, both, meaning, _ = describe_verdict(study_with(words))
     for sentence, word in ((alone, words[0]), (both, words[1])):
-        (low, high), p = OUTCOMES[word]
-        assert f"*{word}*" in sentence and f"{low:.1f} to {high:.1f}" in sentence
-        assert ("21 seeds would decide" in sentence) == (word == "undecided")
-        assert ("< 0.001" if word == "gain" else f"= {p:.3f}") in sentence
-    parts = {
-        "gain": "raise the score here",
-        "harm": "lower the score",
-        "no relevant gain": "a gain of 30 points is excluded",
-        "undecided": "stays open",
-    }
-    assert all(parts[word] in meaning for word in words)
-    assert not any(parts[word] in meaning for word in set(OUTCOMES) - set(words))
-    assert len(" ".join(told[:3]).split()) <= 85  # the overview has these
+        (low, high), _, effect = OUTCOMES[word]
+        verdict = word.removeprefix("small ").partition(",")[0]
+        assert f"*{verdict}*" in sentence and f"{low:.1f} to {high:.1f}" in sentence
+        assert ("trails" in sentence) == (low + high < 0)
+        assert ("121 seeds are sure to decide" in sentence) == (verdict == "undecided")
+        assert effect in meaning
+    assert ("whatever C sees" in meaning) == (words[0] == words[1])
+
+
+def test_the_finding_of_the_overview_has_at_most_120_words_for_every_pair():
+    yaw = {"z": {"yaw rate": {"values": [0.2, 0.3]}}}
+    study3 = {f"agent: {variant}": yaw for variant in VARIANTS}
+    page = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    before = page.partition("## Do difference images help?")[2].partition("<!-- claims:")[0]
+    for words in PAIRS:
+        found = blocks.finding({"study1": study_with(words), "study3": study3})
+        assert len((before + found).split()) <= 120, words
 
 
 def test_the_gain_of_the_paper_is_placed_by_each_interval():
-    *_, gain, _ = describe_verdict(study_with(("gain", "harm")))
+    gain = describe_verdict(study_with(("gain", "harm")))[-1]
     assert "within the interval for z alone and above that for z and h" in gain
-    *_, gain, _ = describe_verdict(study_with(("harm", "harm")))
-    assert "above both intervals" in gain
+    assert "75 points of the paper lie above both" in describe_verdict(study_with(["harm"] * 2))[-1]
 
 
 def test_a_running_study_has_its_progress_alone():
     progress = {"complete_seeds": 3, "planned_seeds": 12, "pipelines": 29, "planned_pipelines": 96}
     (told,) = describe_verdict(progress)
-    assert "running: 3 of 12 seeds are complete, 29 of 96 pipelines" in told
+    assert "3 of 12 seeds are complete, 29 of 96 pipelines" in told

@@ -29,7 +29,7 @@ def comparisons():
 def test_the_forest_plot_has_a_dot_for_each_pipeline_and_a_line_at_the_gain_of_the_paper(
     comparisons,
 ):
-    figure = plot_study(comparisons, MARGIN)
+    figure = plot_study(comparisons, MARGIN, 75.0)
     for axis, features in zip(figure.axes, FEATURES, strict=True):
         drawn = [list(line.get_xdata()) for line in axis.lines]
         for variant in VARIANTS[1:]:
@@ -38,7 +38,7 @@ def test_the_forest_plot_has_a_dot_for_each_pipeline_and_a_line_at_the_gain_of_t
         assert [75, 75] in drawn
     label = figure.get_label()
     assert "a dot for each of 4 seeds" in label
-    assert "C sees z and h, input_output +50 (42 to 58), undecided" in label
+    assert "C sees z and h, input_output +50.0 (42.0 to 58.0), undecided" in label
 
 
 def test_learning_curves_have_a_band_over_the_seeds():
