@@ -39,7 +39,7 @@ def describe_comparison(features: str, one: dict) -> str:
     """The verdict of one primary comparison, with its interval."""
     points, (low, high) = one["difference"], one["interval"]
     leads = f"{'trails' if points < 0 else 'leads'} `frame` by {abs(points):.1f} points"
-    text = f"If C sees {SEES[features]}, the verdict is *{one['verdict']}*: `input_output` {leads}"
+    text = f"With {SEES[features]}, the verdict is *{one['verdict']}*: `input_output` {leads}"
     text += f" (95% interval {low:.1f} to {high:.1f})"
     if one["verdict"] == "undecided":
         text += f"; at this scatter {one['seeds_that_decide']} seeds are sure to decide"
