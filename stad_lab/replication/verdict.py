@@ -62,10 +62,10 @@ def describe_effect(one: dict) -> str:
         return "difference images raise the score" + small * (high < MARGIN)
     if one["verdict"] == "harm":
         return "difference images lower the score" + small * (low > -MARGIN)
-    excluded = f"the interval excludes a gain of {MARGIN} points"
     if one["verdict"] == "no relevant gain":
-        return excluded
-    return "the effect of difference images stays open" + f", but {excluded}" * (high < MARGIN)
+        return f"the interval excludes a gain of {MARGIN} points"
+    below = f", but is below {MARGIN} points"
+    return "the effect of difference images stays open" + below * (high < MARGIN)
 
 
 def describe_paper_gain(primary: dict[str, dict]) -> str:

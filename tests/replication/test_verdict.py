@@ -20,7 +20,7 @@ OUTCOMES = {  # interval and Holm's p, and the effect that the meaning names
     "small harm": ([-25.5, -4.0], 0.012, "lower the score by less than 30 points"),
     "no relevant gain": ([-29.6, 11.0], 0.3, "the interval excludes a gain of 30 points"),
     "undecided": ([-20.0, 41.0], 0.2, "the effect of difference images stays open"),
-    "undecided, no gain": ([-45.0, 20.0], 0.2, "stays open, but the interval excludes a gain"),
+    "undecided, no gain": ([-45.0, 20.0], 0.2, "stays open, but is below 30 points"),
 }
 PAIRS = list(itertools.product(OUTCOMES, repeat=2))
 
