@@ -42,7 +42,7 @@ def describe_comparison(features: str, one: dict) -> str:
     text = f"With {SEES[features]}, the verdict is *{one['verdict']}*: `input_output` {leads}"
     text += f" (95% interval {low:.1f} to {high:.1f})"
     if one["verdict"] == "undecided":
-        text += f"; at this scatter {one['seeds_that_decide']} seeds are sure to decide"
+        text += f"; {one['seeds_that_decide']} seeds would decide"
     return text + "."
 
 
