@@ -168,15 +168,14 @@ def test_a_warning_or_a_progress_bar_under_a_check_costs_no_points():
         "nbgrader": {"grade": True, "solution": False, "grade_id": "a", "points": 3, "locked": True}
     }
     cells = [
+        nbformat.v4.new_code_cell(noise, metadata=grade),
         nbformat.v4.new_code_cell(f"import sys\n{line}"),
         nbformat.v4.new_code_cell(noise, metadata=grade),
     ]
-    points = []
-    for some in (cells, cells[1:]):
-        notebook = nbformat.v4.new_notebook(cells=some)
-        NotebookClient(notebook, timeout=60).execute()
-        points.append(determine_grade(notebook.cells[-1])[0])
-    assert points == [3, 0]  # without the line nbgrader gives none
+    notebook = nbformat.v4.new_notebook(cells=cells)
+    NotebookClient(notebook, timeout=60).execute()
+    points = [determine_grade(cell)[0] for cell in notebook.cells[::2]]
+    assert points == [0, 3]  # before the line nbgrader gives none
 
 
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
