@@ -95,27 +95,30 @@ def gains(claims: dict) -> str:
 
 def verdict_figure(claims: dict) -> str:
     """The forest plot of study 1 for the overview; nothing before the last seed."""
-    found = image("study1", study_figures(claims)) if "comparisons" in claims["study1"] else ""
+    found = image("study1", claims) if "comparisons" in claims["study1"] else ""
     return found.replace("../notebooks", "notebooks")
+
+
+NOT_YET = "They appear here when the last seed is complete."
 
 
 def study1(claims: dict) -> str:
     """Study 1: after the last seed its tests and the forest plot; nothing before."""
     found = claims["study1"]
     if "comparisons" not in found:
-        return "They appear here when the last seed is complete."
-    return f"{comparisons_table(found)}\n\n{image('study1', study_figures(claims))}"
+        return NOT_YET
+    return f"{comparisons_table(found)}\n\n{image('study1', claims)}"
 
 
 def outcomes(claims: dict) -> str:
     """The secondary outcomes of study 1, with the learning curves."""
     found = claims["study1"]
     if "comparisons" not in found:
-        return "They appear here when the last seed is complete."
+        return NOT_YET
     leads = [f"{area_of(found, f, 'input_output')} if {seen}" for f, seen in SEEN.items()]
     told = "Faster learning: over the curve, the validation mean of `input_output` less that of"
     told += f" `frame` is {' and '.join(leads)} (95% intervals)."
-    curves = image("study1_curves", study_figures(claims))
+    curves = image("study1_curves", claims)
     return "\n\n".join([told, outcomes_table(found), curves])
 
 
@@ -199,21 +202,23 @@ def r2_cell(one: dict) -> str:
     return f"{fixed(one['mean'])} ({low} to {high})"
 
 
+FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claims.json
+    "study1": lambda claims: plot_study(claims["study1"]["comparisons"], MARGIN, PAPER_GAIN),
+    "study1_curves": lambda claims: plot_learning_curves(claims["study1"]["curves"]),
+    "study3": lambda claims: plot_representation(claims["study3"]),
+    "study3_random": lambda claims: plot_representation(claims["study3"], "random_driver"),
+}
+
+
 def study_figures(claims: dict) -> dict:
     """The figures of the studies for which there is data: name of the file -> Figure."""
-    one, three, figures = claims["study1"], claims["study3"], {}
-    if "comparisons" in one:
-        figures["study1"] = plot_study(one["comparisons"], MARGIN, PAPER_GAIN)
-        figures["study1_curves"] = plot_learning_curves(one["curves"])
-    if three["seeds"] > 1:
-        figures["study3"] = plot_representation(three)
-        figures["study3_random"] = plot_representation(three, "random_driver")
-    return figures
+    there = {"study1": "comparisons" in claims["study1"], "study3": claims["study3"]["seeds"] > 1}
+    return {name: draw(claims) for name, draw in FIGURES.items() if there[name.partition("_")[0]]}
 
 
-def image(name: str, figures: dict) -> str:
+def image(name: str, claims: dict) -> str:
     """A figure in Markdown, for a page in docs."""
-    return f"![{figures[name].get_label()}](../notebooks/pictures/{name}.png)"
+    return f"![{FIGURES[name](claims).get_label()}](../notebooks/pictures/{name}.png)"
 
 
 def experiments_table(claims: dict) -> str:
@@ -426,7 +431,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "study3, agent": lambda claims: study3(claims, "agent"),
     "study3, random driver": lambda claims: study3(claims, "random_driver"),
     "study3, figures": lambda claims: "\n\n".join(
-        image(name, study_figures(claims)) for name in ("study3", "study3_random")
+        image(name, claims) for name in ("study3", "study3_random")
     ),
     "indicator bar": bar_table,
     "experiments": experiments_table,
