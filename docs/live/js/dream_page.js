@@ -4,7 +4,7 @@
 stad.start(async () => {
   const AGENT = "input_output"; // its V decodes a difference image, too
   const [BEGIN, SHOW_OFF, LONGEST] = [50, 100, 1000]; // frames: CarRacing zooms in until 50
-  const LASTING = 10; // frames that dream and drive must be apart before we call them parted
+  const LASTING = 10; // frames in a row that dream and drive must be apart to have diverged
   const COLORS = stad.COLORS;
   const get = stad.get;
 
@@ -15,7 +15,7 @@ stad.start(async () => {
   let untouched = !stad.prefersStill(); // the first dream begins by itself
   let request = 0; // number of the last wish to close the eyes: a newer one replaces it
   let waiting = false; // for M, to read the drive as far as a wish
-  let [distances, spreads, parted] = [[], [], null];
+  let [distances, spreads, diverged] = [[], [], null];
   let others = []; // distances of earlier dreams from the same frame
   let [vae, mdnRnn, controller, memory] = [null, null, null, null];
 
@@ -68,15 +68,15 @@ stad.start(async () => {
     tell();
   }
 
-  /** Note how far the dream is from the drive, and when they have parted. */
+  /** Note how far the dream is from the drive, and when they have diverged. */
   function compare(frame) {
     const count = dream.frames;
     if (count && from + count < drive.length && distances.at(-1)?.[0] !== count) {
       distances.push([count, stad.rmsDistance(shown.frame, frame)]);
       const last = distances.slice(-LASTING);
-      if (parted === null && last.length === LASTING && last.every(([, one]) => one > level)) {
-        parted = last[0][0];
-        stad.announce(`Dream and drive have parted, ${parted} frames after the eyes closed.`);
+      if (diverged === null && last.length === LASTING && last.every(([, one]) => one > level)) {
+        diverged = last[0][0];
+        stad.announce(`Dream and episode have diverged, ${diverged} frames after the eyes closed.`);
       }
     }
     const xMax = Math.max(200, Math.ceil(count / 100) * 100);
@@ -91,7 +91,7 @@ stad.start(async () => {
         { points: distances, color: COLORS.orange },
       ],
       levels: [{ y: level, text: "1 s apart" }],
-      marks: parted === null ? [] : [{ x: parted, text: `parted: ${parted}` }],
+      marks: diverged === null ? [] : [{ x: diverged, text: `diverged: ${diverged}` }],
     });
     spreadChart.show({ lines: [{ points: spreads, color: COLORS.blue }] });
   }
@@ -111,13 +111,13 @@ stad.start(async () => {
     set("eyes", dream ? "Open the eyes" : waiting ? "Keep them open" : "Close the eyes here");
     set("scrub-value", String(t));
     set(
-      "parted",
-      parted !== null
-        ? `They parted after ${parted} frames (${(parted / 50).toFixed(1)} s).`
+      "diverged",
+      diverged !== null
+        ? `They diverged after ${diverged} frames (${(diverged / 50).toFixed(1)} s).`
         : dream
           ? over
-            ? "The recording ended before they had parted."
-            : "They have not parted yet."
+            ? "The recording ended before they had diverged."
+            : "They have not diverged yet."
           : "Close the eyes to see the curve.",
     );
     get("scrub").value = t;
@@ -168,7 +168,7 @@ stad.start(async () => {
     );
     dream.temperature = Number(get("temperature").value);
     hand.action.set(drive.action(from)); // the car goes on as it was
-    [distances, spreads, parted] = [[], [], null];
+    [distances, spreads, diverged] = [[], [], null];
     stad.announce(`The eyes are closed at frame ${from}: the dream begins.`);
     setPlaying(true);
     draw();

@@ -108,7 +108,7 @@ stad.start(async () => {
     const active = one.kl_of_latents.filter((value) => value > ACTIVE).length;
     const bits = Math.round(one.kl / Math.LN2);
     const text =
-      `z carries ${one.kl.toFixed(1)} nats (${bits} bits) about a frame, ` +
+      `KL of z: ${one.kl.toFixed(1)} nats (${bits} bits) for a frame, ` +
       `in ${active} of ${one.kl_of_latents.length} latents. Squared error: ${distortion(one).toFixed(0)}.`;
     stad.get("summary").textContent = text;
     stad.announce(`KL weight ${one.kl_weight}: ${text}`);

@@ -54,7 +54,7 @@
     const { best, sigma } = history.at(-1);
     const { long, short } = strategy.ellipse();
     const text =
-      `Generation ${strategy.generation}: best fitness ${short3(best)}, σ ${short3(sigma)}, ` +
+      `Generation ${strategy.generation}: lowest value ${short3(best)}, σ ${short3(sigma)}, ` +
       `ellipse ${short3(long)} by ${short3(short)}.` +
       (finished() ? ` Finished${atMinimum()}.` : "");
     stad.get("state").textContent = text;
@@ -145,7 +145,7 @@
     }
   }
 
-  /** Best fitness and sigma over the generations, on a logarithmic scale. */
+  /** Lowest value and sigma over the generations, on a logarithmic scale. */
   function drawProgress() {
     const canvas = stad.get("progress");
     const cleared = stad.clearCanvas(canvas);
@@ -183,7 +183,7 @@
     const { best, sigma } = history.at(-1);
     stad.describe(
       canvas,
-      `Best fitness ${short3(best)} and step size ${short3(sigma)}, on a logarithmic scale.`,
+      `Lowest value ${short3(best)} and step size ${short3(sigma)}, on a logarithmic scale.`,
     );
   }
 
