@@ -122,7 +122,7 @@ class EvolutionConfig:
     step_size_rule: Literal["CSA", "TPA"] = "CSA"
     """How CMA-ES adapts sigma: cumulative step-size adaptation (World Models) or two-point."""
     components: int = 48
-    """Optimise along so many principal components of z and h; 0 for every weight of C."""
+    """Optimise along so many principal components of what C sees, at most; 0 for every weight."""
     features: Literal["z, h", "z", "h"] = "z, h"
     """What C sees."""
     initial_gas: float = -0.5
