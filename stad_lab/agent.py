@@ -282,8 +282,8 @@ def run_folder(source: str | Path) -> Path:
     """The folder of an agent: that of a shipped one by its name, or the folder of a run."""
     if not isinstance(source, str | Path):
         raise ValueError(f"agent {source!r}: expected a shipped agent's name or a run's folder")
-    shipped = PRETRAINED / source
-    return shipped if isinstance(source, str) and shipped.is_dir() and source else Path(source)
+    shipped = {folder.name for folder in PRETRAINED.iterdir()}
+    return PRETRAINED / source if source in shipped else Path(source)
 
 
 def load_agent(source: str | Path) -> Agent:
