@@ -1,4 +1,4 @@
-"""Every statistic that a page shows, computed from the tables and written to `data/claims.json`.
+"""The statistics of pages and notebooks, computed from the tables and written to claims.json.
 
 `python -m stad_lab claims` renews that file after a run was added. Scores are returns of CarRacing;
 intervals are [low, high], of 95%.
@@ -25,7 +25,7 @@ WORLD_MODELS = {25600: 823.0, 51200: 867.0, 204800: 880.0, 1843200: 900.5}  # ep
 
 def compute_claims() -> dict[str, dict]:
     """All statistics as plain numbers: section -> name -> statistics."""
-    episodes, runs, generations = tables.episodes(), tables.read("runs"), tables.read("generations")
+    episodes, runs = tables.episodes(), tables.read("runs")
     made = [name for name in (*BASELINE_DRIVERS, *EXPERIMENTS) if name in set(episodes.experiment)]
     trained = [name for name in made if name in set(runs.query("role == 'world_model'").experiment)]
     return {
@@ -33,7 +33,6 @@ def compute_claims() -> dict[str, dict]:
         "study3": study_claims.describe_study3(),
         "agents": describe_agents(),
         "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
-        "final_sigma": final_sigma(generations),
         "probe": measurements.describe_probe(tables.read("probe")),
         "models": measurements.describe_models(tables.read("model_metrics")),
         "stage_minutes": {name: measurements.stage_minutes(runs, name) for name in trained},
@@ -85,14 +84,6 @@ def learning_curve(
     driven = run["total.episodes"] - own + log["generation"] * settings.population * settings.tracks
     driven += validated.cumsum() * settings.validation_tracks
     return driven[validated].to_numpy(np.int64), log["validation.mean"][validated].to_numpy()
-
-
-def final_sigma(generations: pandas.DataFrame) -> dict:
-    """The last step size of each run of the paper's recipe, and the geometric mean of them."""
-    paper = generations[generations.experiment.str.startswith("paper_")]
-    last = paper.groupby(["experiment", "seed"])["sigma"].last()
-    each = {tables.key(*run): float(sigma) for run, sigma in last.items()}
-    return {"geometric_mean": float(np.exp(np.log(last).mean())), **each}
 
 
 def write_claims(path: Path = CLAIMS) -> Path:

@@ -2,14 +2,13 @@
 
 A run is named by `experiment`, `role` and `seed`. The role is "run" (CMA-ES for C, evaluated),
 "first_iteration" (of a recipe with two) or "world_model" (only V and M); the last two serve the run
-of the same seed and those after it, up to the next. C of each run is in `data/controllers`.
+of the same seed and those after it, up to the next.
 
 A pipeline of a study (docs/protocol.md) is named by `study`, `variant`, `features` and `seed`, and
 has lines in the tables `study_runs`, `study_generations` and `study_episodes`. What its V carries
 is in `study_probe`.
 """
 
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +31,6 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
     "fast_episodes": (["agent", "processor", "track"], ["return", "frames"]),
     "generations": ([*RUN, "generation"], ["worst", "mean", "best", "sigma", "frames"]),
     "runs": (RUN, ["variant", "commit"]),
-    "histories": ([*RUN, "network", "step", "data"], ["total"]),
     "probe": (["world_model", "seed", "driver", "features", "quantity"], ["variant", "r2"]),
     "model_metrics": (["model", "world_model", "metric", "index"], ["value"]),
     "speed": (["part", "measure", "condition", "round"], ["value"]),
@@ -88,18 +86,9 @@ def returns_of(table: pandas.DataFrame, column: str = "return") -> dict[str, np.
     return {name: wide.loc[name].to_numpy() for name in table["experiment"].unique()}
 
 
-def fitness(run: str, folder: Path = DATA) -> dict[str, np.ndarray]:
-    """All returns of a CMA-ES run (named as by `key`), the seeds of its tracks, and validations.
-
-    Shapes: (generations, agents, tracks), (generations, tracks) and (validations, tracks).
-    """
-    with np.load(folder / "fitness.npz") as file:
-        return {part: file[f"{run}/{part}"] for part in ("returns", "tracks", "validation")}
-
-
-def key(experiment: str, seed: int, role: str = "run") -> str:
-    """The name of a run in file names, for example "paper_frame-0"."""
-    return f"{experiment}-{seed}" + f"-{role}" * (role != "run")
+def key(experiment: str, seed: int) -> str:
+    """The name of a run, for example "paper_frame-0"."""
+    return f"{experiment}-{seed}"
 
 
 def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str = "run") -> None:
@@ -123,13 +112,7 @@ def add_run(folder: Path, experiment: str, seed: int, to: Path = DATA, role: str
         add_log(run, log["generations"], to)
     for network in ("vae", "mdn_rnn"):
         if (path := folder / f"{network}.safetensors").exists() and role != "run":
-            metadata = load_tensors(path)[1]
-            line[network] = metadata["weights"]
-            add_history(run | {"network": network}, metadata["history"], to)
-    if file.exists():
-        copies = to / "controllers"
-        copies.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(file, copies / f"{key(**run)}.safetensors")
+            line[network] = load_tensors(path)[1]["weights"]
     replace_lines("runs", pandas.DataFrame([line]), to)
 
 
@@ -175,28 +158,16 @@ def describe_record(record: dict) -> dict:
 
 
 def add_log(run: dict, log: list[dict], to: Path) -> None:
-    """Add the generations of a CMA-ES run to `generations` and to the file of all returns."""
+    """Add the generations of a CMA-ES run to `generations`."""
     lines = pandas.DataFrame([run | flatten(entry) for entry in log])
     lines["worst"], lines["mean"], lines["best"] = fitness_curves(log)
     arrays = ["returns", "tracks", "validation.returns"]
     replace_lines("generations", lines.drop(columns=arrays), to)
-    path = to / "fitness.npz"
-    kept = dict(np.load(path)) if path.exists() else {}
-    for name in arrays:
-        kept[f"{key(**run)}/{name.split('.')[0]}"] = np.array(lines[name].dropna().tolist())
-    np.savez_compressed(path, **{name: kept[name] for name in sorted(kept)})
-
-
-def add_history(network: dict, history: list[dict], to: Path) -> None:
-    """Add the losses of a network's training to `histories`."""
-    both = [(entry, data) for entry in history for data in ("train", "heldout")]
-    lines = [network | {"step": one["step"], "data": data} | one[data] for one, data in both]
-    replace_lines("histories", pandas.DataFrame(lines), to)
 
 
 def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
-    """Write a table with new lines in the place of those of the same run (and network)."""
-    run = [column for column in TABLES[name][0] if column in (*RUN, "network", *PIPELINE)]
+    """Write a table with new lines in the place of those of the same run or pipeline."""
+    run = [column for column in TABLES[name][0] if column in (*RUN, *PIPELINE)]
     if (folder / f"{name}.csv").exists():
         old = read(name, folder)
         new = pandas.MultiIndex.from_frame(lines[run])
