@@ -13,6 +13,8 @@ from gallery import CELLS, PICTURES
 from PIL import Image
 
 from stad_lab import cli, config
+from stad_lab.agent import PRETRAINED
+from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.replication.claims import PAPER
 from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
 from stad_lab.replication.verdict import PAPER_GAIN, describe_verdict
@@ -27,11 +29,7 @@ from stad_lab.viz.replication import (
 )
 
 PACKAGE = Path(config.__file__).parent
-PRETRAINED = PACKAGE / "pretrained"
 AGENTS = (*config.VARIANTS, "cropped_input")
-QUANTITIES = (
-    "forward speed", "slip speed", "yaw rate", "wheel angle", "road offset", "heading error",
-)  # fmt: skip
 
 
 def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
@@ -173,11 +171,10 @@ def study3(claims: dict, driver: str) -> str:
     """R2 from z, and from z and h, with one driver: means over the seeds so far with intervals."""
     found, lines = claims["study3"], []
     names = [name for name in found if name.startswith(f"{driver}: ")]
-    names = sorted(names, key=lambda name: ("untrained" in name, len(name)))
     for features, name in itertools.product(FEATURES, names):
-        cells = [r2_cell(found[name][features][quantity]) for quantity in QUANTITIES]
+        cells = [r2_cell(found[name][features][quantity]) for quantity in MOTION]
         lines.append([network(name.partition(": ")[2]), SOURCES[features], *cells])
-    return table(("V", "from", *QUANTITIES), lines)
+    return table(("V", "from", *MOTION), lines)
 
 
 def turning_table(claims: dict) -> str:
@@ -247,9 +244,9 @@ def bar_table(claims: dict) -> str:
     lines = []
     for variant in config.VARIANTS:
         alone, both = (r2(claims, "agent", f"{variant}-0", features) for features in FEATURES)
-        cells = [f"{fixed(alone[one])} ({fixed(both[one])})" for one in QUANTITIES]
+        cells = [f"{fixed(alone[one])} ({fixed(both[one])})" for one in MOTION]
         lines.append((f"`{variant}`", *cells))
-    return table(("V", *QUANTITIES), lines)
+    return table(("V", *MOTION), lines)
 
 
 # The agents
@@ -306,8 +303,8 @@ def probe_card(claims: dict, name: str) -> str:
     for driver, title in (("agent", "trained agent"), ("random_driver", "random driver")):
         for features in ("z", "z, h"):
             found = r2(claims, driver, f"{name}-0", features)
-            lines.append((title, features, *(f"{fixed(found[one])}" for one in QUANTITIES)))
-    return table(("driver", "features", *QUANTITIES), lines)
+            lines.append((title, features, *(f"{fixed(found[one])}" for one in MOTION)))
+    return table(("driver", "features", *MOTION), lines)
 
 
 # Speed

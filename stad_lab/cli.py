@@ -431,7 +431,10 @@ def latents(
 
 
 def benchmark(
-    parts: tuple[str, ...] = (), rounds: int = 5, json: Path = Path("benchmark.json")
+    parts: tuple[str, ...] = (),
+    rounds: int = 5,
+    json: Path = Path("benchmark.json"),
+    add: bool = False,
 ) -> None:
     """Measure speeds side by side with Gymnasium and EnvPool, on a machine that does nothing else.
 
@@ -439,13 +442,17 @@ def benchmark(
         parts: Some of parity, renderer, loop, training, run; all if not given.
         rounds: How often the contenders take turns.
         json: Where to write every measurement.
+        add: Put them into the tables, too, in place of the same parts.
     """
     from stad_lab.benchmark import PARTS, benchmark
     from stad_lab.evaluation.evaluate import check_output
+    from stad_lab.replication.tables import add_speed
 
     check_output(json)
     benchmark(list(parts) or list(PARTS), rounds, json)
     print(f"\nevery measurement: {json}")
+    if add:
+        add_speed(json)
 
 
 def ship(run: str, name: str) -> None:

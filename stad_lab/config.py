@@ -246,7 +246,7 @@ def check_together(config: Config) -> None:
     if evolution.generations % evolution.validate_every:
         raise ValueError(
             f"evolution.generations={evolution.generations} is not a multiple of"
-            f" evolution.validate_every={evolution.validate_every}: the last one is validated"
+            f" evolution.validate_every={evolution.validate_every}: the last must be validated"
         )
     last_sigma = evolution.sigma * evolution.sigma_decay**evolution.generations
     if evolution.sigma_decay and last_sigma < SMALLEST_SIGMA:

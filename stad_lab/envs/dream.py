@@ -6,14 +6,15 @@ CarRacing, M predicts neither reward nor the end of an episode: the reward is al
 ends after `max_frames`.
 """
 
-import math
 from typing import ClassVar
 
 import gymnasium as gym
 import numpy as np
 import torch
 
-ACTION_SIZE = 3  # steering, gas, brake
+from stad_lab.models.controller import ACTION_SIZE
+from stad_lab.models.mdn_rnn import check_temperature
+from stad_lab.models.vae import to_uint8
 
 
 class DreamEnv(gym.Env):
@@ -43,8 +44,7 @@ class DreamEnv(gym.Env):
         max_frames: int = 1000,
         render_mode: str | None = None,
     ):
-        if not 0 < temperature < math.inf:
-            raise ValueError(f"temperature={temperature}: expected a finite number above 0")
+        check_temperature(temperature)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode={render_mode!r}: expected 'rgb_array' or None")
         self.vae, self.mdn_rnn = vae, mdn_rnn
@@ -106,8 +106,7 @@ class DreamEnv(gym.Env):
         if self.render_mode is None:
             return None
         self._check_begun("render")
-        frame = self.vae.decode(self.latents[None])[0][0]
-        return (frame.permute(1, 2, 0) * 255).round().byte().numpy()
+        return to_uint8(self.vae.decode(self.latents[None])[0])[0]
 
     def _check_begun(self, call: str) -> None:
         if self.latents is None:

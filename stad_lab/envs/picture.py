@@ -131,11 +131,11 @@ class Ground(NamedTuple):
     texels: np.ndarray
     """uint8 (cars, SIZE, SIZE), kinds, shades and flags."""
     quarter: np.ndarray
-    """uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours (red in the lowest byte)."""
+    """uint32 (cars, SIZE / 4, SIZE / 4), a smaller copy, in colours (red in the lowest byte)."""
     eighth: np.ndarray
-    """uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours (red in the lowest byte)."""
+    """uint32 (cars, SIZE / 8, SIZE / 8), the same."""
     sixteenth: np.ndarray
-    """uint32 (cars, SIZE / n, SIZE / n), smaller copies, in colours (red in the lowest byte)."""
+    """uint32 (cars, SIZE / 16, SIZE / 16), the same."""
     colors: np.ndarray
     """uint8 (cars, 8, 3), in the order of TEXELS."""
     palette: np.ndarray
@@ -959,7 +959,8 @@ def all_finite(hull, wheels, reward):
 def draw_picture(out, ground, pictures, car, hull, wheels, reward, time, bar):
     """Draw the observation or the agent's frame of one car.
 
-    The frame equals, up to rounding near edges, the observation after `stad_lab.frames.to_frame`.
+    The frame equals, up to rounding near edges, the observation after
+    `stad_lab.envs.frames.to_frame`.
 
     Args:
         out: uint8, to write: (96, 96, 3) for the observation, (64, 64, 3) for the frame.

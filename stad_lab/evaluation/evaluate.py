@@ -79,7 +79,7 @@ def evaluate(
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
                 now = {"asked": asked, "driven": driven, "seconds": time.perf_counter() - begin}
-                with suppress(OSError):  # a full disk costs the right to continue, not the result
+                with suppress(OSError):  # with a full disk it goes on, but cannot be resumed
                     save_json(unfinished, now)
     returns, lengths = zip(*(driven[str(track)] for track in tracks), strict=True)
     result = report(tracks, np.array(returns), np.array(lengths))

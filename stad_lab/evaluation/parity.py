@@ -44,8 +44,9 @@ def compare(cars: Cars, ours: np.ndarray, theirs: np.ndarray) -> list[float]:
     """Differences between observations of a car, and from its frames, in the order of AREAS."""
     places = (..., CAR_WINDOW, slice(BAR_TOP, None))
     pairs = [(ours[place], theirs[place]) for place in places]
-    for cars.bar in (False, True):
-        cars.shows = "frame"
-        frame, cars.shows = cars.draw()[0], "observation"
-        pairs += [(frame, to_frame(seen, crop_bar=not cars.bar)) for seen in (ours, theirs)]
+    for bar in (False, True):
+        cars.shows, cars.bar = "frame", bar
+        frame = cars.draw()[0]
+        pairs += [(frame, to_frame(seen, crop_bar=not bar)) for seen in (ours, theirs)]
+    cars.shows = "observation"
     return [float(np.abs(one.astype(np.int16) - other).mean()) for one, other in pairs]

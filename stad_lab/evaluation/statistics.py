@@ -74,15 +74,15 @@ def interquartile_mean(values: np.ndarray) -> float:
 
 
 def pairs_that_decide(deviation: float, margin: float, tests: int) -> int:
-    """The smallest number of pairs, at least 2, whose paired t-test is sure to decide.
+    """The fewest pairs, at least 2, with which the paired t-test cannot end undecided.
 
-    Whatever the mean: either Holm's p over so many tests is below 0.05, or the 95% interval lies
-    within +-margin. If p is not, the mean is within the wider half-width of the level 0.05 / tests,
-    and the end of the interval is further by the half-width of 95%: both together must fit into the
-    margin. `deviation`: of the paired differences.
+    `deviation` is that of the paired differences. If Holm's p over so many tests is not below 0.05,
+    the mean is within the half-width of the level 0.05 / tests. The 95% interval reaches its own
+    half-width further, so the sum of both must fit into the margin. ValueError if there is no such
+    number below 100,000.
     """
     for pairs in range(2, 100_000):
         both = stats.t.ppf([0.975, 1 - 0.025 / tests], pairs - 1).sum()
         if both * deviation / np.sqrt(pairs) <= margin:
             return pairs
-    raise ValueError(f"deviation={deviation}: expected a finite number below {100 * margin:.0f}")
+    raise ValueError(f"deviation={deviation}: 100,000 pairs would not decide")

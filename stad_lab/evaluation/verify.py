@@ -32,7 +32,7 @@ MISSING = "none: trained elsewhere or not yet"
 
 
 class NotRepeated(ValueError):
-    """The same again gave something else, which is a fault only on the same machine."""
+    """A repetition gave another result: an error only on the recorded machine."""
 
 
 def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, str]:

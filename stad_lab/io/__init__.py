@@ -1,1 +1,1 @@
-"""Files that survive, and who computes."""
+"""Files, locks and workers."""

@@ -1,4 +1,4 @@
-"""Files that survive: atomic writes, reads that notice every changed bit, and locked folders.
+"""Safe files: atomic writes, reads that notice every changed bit, and locked folders.
 
 Weights are safetensors, everything else is JSON; nothing that is read can run code. A file is
 written under another name, flushed to the disk and then renamed, so that a reader sees the old

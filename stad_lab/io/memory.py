@@ -19,7 +19,7 @@ def keep_freed_memory() -> None:
 
 
 def return_freed_memory() -> None:
-    """Give it back after all, now and then: in time it is cut into pieces, and more is needed."""
+    """Give freed memory back now and then: otherwise it fragments, and the process grows."""
     if library := c_library():
         library.malloc_trim(0)
 

@@ -27,7 +27,7 @@ import stad_lab
 
 PRELOADED = ["stad_lab.training.evolution"]  # a worker's imports take 2 to 4 seconds
 PATIENCE = 3600.0  # seconds without any finished task, after which the workers count as stuck
-SLICES = 3600  # in which the waiting is counted: a suspended machine loses one of them
+SLICES = 3600  # of the waiting: a suspended machine loses one of them, not all its patience
 
 # Set in a thread whose work nobody waits for any more; `rollout` looks at it in every frame.
 CANCELLED: contextvars.ContextVar[threading.Event | None] = contextvars.ContextVar(

@@ -1,1 +1,1 @@
-"""The seat at the wheel."""
+"""Driving by hand, in a notebook."""

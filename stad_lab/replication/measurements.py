@@ -1,6 +1,6 @@
-"""What the pages show beside mean scores: lost points, the probe, quality of V and M, speeds.
+"""What pages and notebooks show beside mean scores: lost points, the probe, V and M, speeds.
 
-Each function turns a table into nested dicts of plain numbers, for `stad_lab.replication.claims`.
+Each function gives nested dicts of plain numbers.
 """
 
 from collections import defaultdict

@@ -1,7 +1,7 @@
 """The statistics of the studies that docs/protocol.md fixes, computed from their tables.
 
 Study 1 compares variants with `frame`, once where C sees z, and once where it sees z and h. Before
-its last pipeline is in the tables, only the progress is told: nothing is tested or shown earlier.
+its last pipeline is in the tables, only the progress is reported: nothing is tested earlier.
 """
 
 from pathlib import Path
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 
+from stad_lab.config import VARIANTS
 from stad_lab.evaluation import statistics
 from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.replication import tables
@@ -90,7 +91,7 @@ def compare_family(
         one["holm_p"] = p
         one["verdict"] = find_verdict(one["interval"], p)
         deviation = float(np.std(one["by_seed"], ddof=1))
-        more = len(one["by_seed"]) + 1  # the t-test might have decided with fewer
+        more = len(one["by_seed"]) + 1  # reported only if undecided, so more than were run
         seeds = max(more, statistics.pairs_that_decide(deviation, MARGIN, len(found)))
         one |= {"deviation": deviation, "seeds_that_decide": seeds}
     return found
@@ -179,7 +180,9 @@ def describe_study3(folder: Path = tables.DATA, study: str = "study1") -> dict:
     found["networks"] = len(probed[["variant", "seed"]].drop_duplicates())
     if found["seeds"] < 2:
         return found
-    for (driver, trained, variant), own in table.groupby(["driver", "trained", "variant"]):
+    groups = dict(list(table.groupby(["driver", "trained", "variant"])))
+    for key in sorted(groups, key=lambda key: (key[0], not key[1], VARIANTS.index(key[2]))):
+        (driver, trained, variant), own = key, groups[key]
         name = f"{driver}: {variant}" + ", untrained" * (not trained)
         wide = own.pivot(index="seed", columns=["features", "quantity"], values="r2")
         found[name] = {

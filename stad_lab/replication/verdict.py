@@ -10,7 +10,7 @@ from stad_lab.replication.study_claims import FEATURES, MARGIN
 
 PAPER_GAIN = min(PAPER[name] for name in VARIANTS[1:]) - PAPER["frame"]  # the smallest
 SEES = {"z": "z alone", "z, h": "z and h"}
-ORDER = ("gain", "harm", "no relevant gain", "undecided")  # of telling
+ORDER = ("gain", "harm", "no relevant gain", "undecided")  # which verdict the sentence names first
 
 
 def describe_verdict(study: dict) -> list[str]:

@@ -102,7 +102,6 @@ def plot_representation(study3: dict, driver: str = "agent") -> Figure:
     """
     start = f"{driver}: "
     rows = {name.removeprefix(start): one for name, one in study3.items() if name.startswith(start)}
-    rows = dict(sorted(rows.items(), key=lambda row: (", untrained" in row[0], len(row[0]))))
     parts = "mean", "interval", "values"
     panels = {
         quantity: {

@@ -13,6 +13,7 @@ from stad_lab.agent import Agent
 from stad_lab.dreaming import dream_on
 from stad_lab.envs.frames import earlier_frames, to_pictures
 from stad_lab.evaluation.trajectories import (
+    FRAMES_A_SECOND,
     Inspection,
     Trajectory,
     inspect_trajectory,
@@ -21,7 +22,6 @@ from stad_lab.evaluation.trajectories import (
 from stad_lab.models.vae import to_tensor, to_uint8
 from stad_lab.viz.plots import difference_colors, plot_moment, to_png
 
-FPS = 50  # frames a second of CarRacing's physics
 EVERY = 3  # one of so many frames is shown, at the real speed
 DREAM = 100  # frames of an open-loop dream: two seconds
 
@@ -95,7 +95,7 @@ def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
         "V's reconstruction": to_uint8(reconstruction),
         "dream": repeated_dreams(agent, trajectory, first)[::EVERY],
     }
-    return animate_pictures(columns, fps=FPS / EVERY)
+    return animate_pictures(columns, fps=FRAMES_A_SECOND / EVERY)
 
 
 def repeated_dreams(
@@ -128,7 +128,7 @@ def film_trajectory(
     """The trajectory viewer as an animation, one moment in EVERY, at the real speed."""
     moments = tqdm(range(first, len(trajectory), EVERY), "film", unit="picture")
     figures = (plot_moment(trajectory, inspection, moment) for moment in moments)
-    return animate_figures(figures, FPS / EVERY, kind)
+    return animate_figures(figures, FRAMES_A_SECOND / EVERY, kind)
 
 
 def record_longer(agent: Agent, track: int, first: int, frames: int) -> Trajectory:

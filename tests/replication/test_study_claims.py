@@ -212,6 +212,7 @@ def test_r2_has_a_value_for_each_seed_and_an_interval_of_their_mean(tmp_path):
     expected = stats.t.interval(0.95, 2, loc=0.4, scale=0.1 / 3**0.5)
     assert one["interval"] == pytest.approx(expected)
     assert found["agent: frame, untrained"]["z"]["yaw rate"]["values"] == [0.01] * 3
+    assert list(found)[3:] == ["agent: frame", "agent: input", "agent: frame, untrained"]
     assert describe_study3(tmp_path / "empty")["seeds"] == 0
 
 
