@@ -104,11 +104,13 @@ def test_the_training_of_v_and_m_is_timed(tmp_path):
         assert 1 < speed < 1e9
 
 
-def test_the_command_writes_every_measurement(tmp_path, monkeypatch, capsys):
+def test_the_command_writes_every_measurement_and_adds_it_if_asked(tmp_path, monkeypatch, capsys):
+    added = []
+    monkeypatch.setattr("stad_lab.replication.tables.add_speed", added.append)
     monkeypatch.setattr("stad_lab.benchmark.MAX_FRAMES", 30)  # of a round
     file = tmp_path / "benchmark.json"
-    options = ["--parts", "renderer", "--rounds", "1", "--json", str(file)]
-    assert main(["benchmark", *options]) == 0
+    options = ["--parts", "renderer", "--rounds", "1", "--json", str(file), "--add"]
+    assert main(["benchmark", *options]) == 0 and added == [file]
     printed = capsys.readouterr().out
     result = json.loads(file.read_text(encoding="utf-8"))
     table = result["renderer"]["frames a second on one core"]
