@@ -81,37 +81,25 @@ def verdict(claims: dict) -> str:
 
 def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
-    if "comparisons" not in (found := claims["study1"]):
-        return describe_verdict(found)[0]
-    alone, both = (
-        difference_of(found["comparisons"][f"{features}: input_output"]) for features in FEATURES
-    )
+    found = claims["study1"]["comparisons"]
+    alone, both = (difference_of(found[f"{features}: input_output"]) for features in FEATURES)
     told = f"With difference images the score changes by {alone} points without M's memory and by"
     return f"{told} {both} points with it (95% intervals)."
 
 
 def verdict_figure(claims: dict) -> str:
-    """The forest plot of study 1 for the overview; nothing before the last seed."""
-    found = image("study1", claims) if "comparisons" in claims["study1"] else ""
-    return found.replace("../notebooks", "notebooks")
-
-
-NOT_YET = "They appear here when the last seed is complete."
+    """The forest plot of study 1 for the overview."""
+    return image("study1", claims).replace("../notebooks", "notebooks")
 
 
 def study1(claims: dict) -> str:
-    """Study 1: after the last seed its tests and the forest plot; nothing before."""
-    found = claims["study1"]
-    if "comparisons" not in found:
-        return NOT_YET
-    return f"{comparisons_table(found)}\n\n{image('study1', claims)}"
+    """The tests of study 1, and the forest plot."""
+    return f"{comparisons_table(claims['study1'])}\n\n{image('study1', claims)}"
 
 
 def outcomes(claims: dict) -> str:
     """The secondary outcomes of study 1, with the learning curves."""
     found = claims["study1"]
-    if "comparisons" not in found:
-        return NOT_YET
     leads = [f"{area_of(found, f, 'input_output')} if {seen}" for f, seen in SEEN.items()]
     told = "Faster learning: over the curve, the validation mean of `input_output` less that of"
     told += f" `frame` is {' and '.join(leads)} (95% intervals)."
@@ -168,7 +156,7 @@ def area_of(study: dict, features: str, variant: str) -> str:
 
 
 def study3(claims: dict, driver: str) -> str:
-    """R2 from z, and from z and h, with one driver: means over the seeds so far with intervals."""
+    """R2 from z, and from z and h, with one driver: means over the seeds with intervals."""
     found, lines = claims["study3"], []
     names = [name for name in found if name.startswith(f"{driver}: ")]
     for features, name in itertools.product(FEATURES, names):
@@ -204,12 +192,6 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
     "study3": lambda claims: plot_representation(claims["study3"]),
     "study3_random": lambda claims: plot_representation(claims["study3"], "random_driver"),
 }
-
-
-def study_figures(claims: dict) -> dict:
-    """The figures of the studies for which there is data: name of the file -> Figure."""
-    there = {"study1": "comparisons" in claims["study1"], "study3": claims["study3"]["seeds"] > 1}
-    return {name: draw(claims) for name, draw in FIGURES.items() if there[name.partition("_")[0]]}
 
 
 def image(name: str, claims: dict) -> str:

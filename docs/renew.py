@@ -11,7 +11,7 @@ import re
 import sys
 from pathlib import Path
 
-from blocks import BLOCKS, NUMBERS, study_figures
+from blocks import BLOCKS, FIGURES, NUMBERS
 from gallery import PICTURES
 
 from stad_lab.replication.claims import read_claims
@@ -69,8 +69,8 @@ def main() -> int:
         if not check:
             file.write_text(text, encoding="utf-8")
     if not check:
-        for name, figure in study_figures(claims).items():
-            (PICTURES / f"{name}.png").write_bytes(to_png(figure))
+        for name, draw in FIGURES.items():
+            (PICTURES / f"{name}.png").write_bytes(to_png(draw(claims)))
     return int(check and bool(found))
 
 

@@ -16,23 +16,12 @@ ORDER = ("gain", "harm", "no relevant gain", "undecided")  # which verdict the s
 def describe_verdict(study: dict) -> list[str]:
     """Four sentences: the verdict for both C, what it means, and the paper's gain beside it.
 
-    While the study is running, a single sentence with its progress.
-
     Args:
-        study: what `describe_study1` returns.
+        study: what `describe_study1` returns after the last pipeline.
     """
-    if "comparisons" not in study:
-        return [describe_running(study)]
     primary = {features: study["comparisons"][f"{features}: input_output"] for features in FEATURES}
     told = [describe_comparison(features, one) for features, one in primary.items()]
     return [*told, describe_meaning(primary), describe_paper_gain(primary)]
-
-
-def describe_running(study: dict) -> str:
-    """How much of the study is done."""
-    text = "The study is running: {complete_seeds} of {planned_seeds} seeds are complete,"
-    text += " {pipelines} of {planned_pipelines} pipelines."
-    return text.format(**study) + " Nothing is tested before the last seed is complete."
 
 
 def describe_comparison(features: str, one: dict) -> str:

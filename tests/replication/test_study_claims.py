@@ -164,17 +164,10 @@ def test_nothing_is_tested_before_the_last_pipeline_is_there(full, tmp_path):
     assert describe_study1(tmp_path / "empty")["pipelines"] == 0
 
 
-def test_the_pages_have_the_progress_until_the_last_seed_and_then_every_result(found):
-    study3 = {"seeds": 0, "planned_seeds": 12, "networks": 0}
-    progress = {"complete_seeds": 3, "planned_seeds": 12, "pipelines": 29, "planned_pipelines": 96}
-    claims = {"study1": progress | {"trained_on": {"cpu": 8, "cuda": 7}}, "study3": study3}
-    for block in (blocks.verdict, blocks.gains):
-        assert "3 of 12 seeds are complete" in block(claims)
+def test_the_pages_have_every_result_of_the_study(found):
+    claims = {"study1": found}
     numbers = [blocks.NUMBERS[name](claims) for name in ("networks of a GPU", "trained networks")]
-    assert numbers == [7, 15] and blocks.verdict_figure(claims) == ""
-    assert "|" not in blocks.study1(claims) + blocks.outcomes(claims)
-    assert not blocks.study_figures(claims)
-    claims["study1"] = found
+    assert numbers == [12, 48]
     page = blocks.study1(claims)
     for name, one in found["comparisons"].items():
         features, variant = name.split(": ")

@@ -63,9 +63,3 @@ def test_the_gain_of_the_paper_is_placed_by_each_interval():
     gain = describe_verdict(study_with(("gain", "harm")))[-1]
     assert "within the interval for z alone and above that for z and h" in gain
     assert "75 points of the paper lie above both" in describe_verdict(study_with(["harm"] * 2))[-1]
-
-
-def test_a_running_study_has_its_progress_alone():
-    progress = {"complete_seeds": 3, "planned_seeds": 12, "pipelines": 29, "planned_pipelines": 96}
-    (told,) = describe_verdict(progress)
-    assert "3 of 12 seeds are complete, 29 of 96 pipelines" in told
