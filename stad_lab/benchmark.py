@@ -46,7 +46,8 @@ from stad_lab.models.vae import VAE
 from stad_lab.training.dataset import Dataset, RandomDriver, collect
 from stad_lab.training.evolution import drive_parallel
 from stad_lab.training.mdn_rnn import Latents, mdn_rnn_training
-from stad_lab.training.pipeline import RECORD, STAGES, provenance, train
+from stad_lab.training.pipeline import STAGES, train
+from stad_lab.training.record import RECORD, provenance
 from stad_lab.training.trainer import Training, read_ahead, update
 from stad_lab.training.vae import vae_training
 

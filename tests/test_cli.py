@@ -27,7 +27,8 @@ from stad_lab.io.weights import (
 )
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
-from stad_lab.training.pipeline import STAGES, command_of
+from stad_lab.training.pipeline import STAGES
+from stad_lab.training.record import command_of
 
 QUICK = Config.preset("quick")
 

@@ -8,7 +8,7 @@ from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.io.files import checksum_of_arrays, load_json
 from stad_lab.io.weights import load_mdn_rnn, load_vae, load_world_model
 from stad_lab.training.evolution import fitness_curves
-from stad_lab.training.pipeline import processor
+from stad_lab.training.record import processor
 
 WORLD_MODELS = sorted(file.parent.name for file in PRETRAINED.glob("*/vae.safetensors"))
 AGENTS = shipped_agents()

@@ -27,7 +27,7 @@ from stad_lab.evaluation.trajectories import encode_trajectory, record_trajector
 from stad_lab.io.files import load_json
 from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_controller, load_world_model
 from stad_lab.training.evolution import LOG, ask, fitness_curves, make_strategy, tell
-from stad_lab.training.pipeline import RECORD
+from stad_lab.training.record import RECORD
 from stad_lab.training.subspace import search_space
 
 DATA = Path(__file__).parent / "data"

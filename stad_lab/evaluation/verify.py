@@ -23,9 +23,18 @@ from stad_lab.io.weights import (
     load_world_model,
 )
 from stad_lab.io.workers import TaskError, run_in_order, worker_processes, worker_threads
-from stad_lab.training import evolution, pipeline
+from stad_lab.training import evolution
 from stad_lab.training.dataset import MANIFEST, Dataset, check_seen, count_episodes
 from stad_lab.training.mdn_rnn import check_mdn_rnn
+from stad_lab.training.record import (
+    GIVE_A_RUN,
+    MACHINE,
+    PACKAGES,
+    RECORD,
+    check_record,
+    provenance,
+    starts,
+)
 
 AGAIN = 3  # recorded episodes that are driven again
 MISSING = "none: trained elsewhere or not yet"
@@ -46,8 +55,8 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         FileNotFoundError, ValueError: no record in the folder, or a damaged one.
     """
     folder = Path(folder)
-    pipeline.check_record(folder)
-    record = load_json(folder / pipeline.RECORD, pipeline.GIVE_A_RUN, kind="record")
+    check_record(folder)
+    record = load_json(folder / RECORD, GIVE_A_RUN, kind="record")
     config = Config.from_dict(record["config"])
     dataset, vae = folder / "dataset", folder / VAE_FILE
     models, log = (VAE_FILE, MDN_RNN_FILE), evolution.LOG
@@ -62,8 +71,8 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         "evaluations": (lambda: verify_evaluations(folder),),
         "episodes": (lambda: drive_again(folder, config, executor), *models, CONTROLLER_FILE),
     }
-    here = pipeline.provenance("")
-    excuses = [other_machine(start, here) for start in pipeline.starts(record)]
+    here = provenance("")
+    excuses = [other_machine(start, here) for start in starts(record)]
     excuse = "; ".join(filter(None, excuses))
     found = {}
     for name, (check, *needed) in checks.items():
@@ -86,7 +95,7 @@ def other_machine(made_with: dict, here: dict) -> str:
     """In what this machine differs from the recorded one; empty if in nothing."""
     return ", ".join(
         f"{name} is {here[name]!r} and was {made_with.get(name, 'not recorded')!r}"
-        for name in (*pipeline.MACHINE, *pipeline.PACKAGES)
+        for name in (*MACHINE, *PACKAGES)
         if here[name] != made_with.get(name)
     )
 

@@ -15,7 +15,7 @@ from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
 from stad_lab.replication import measurements, study_claims, tables
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
-from stad_lab.training.pipeline import total_budget
+from stad_lab.training.record import total_budget
 
 CLAIMS = tables.DATA / "claims.json"
 PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # on CarRacing-v0

@@ -41,7 +41,8 @@ from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE, kl_divergence
 from stad_lab.training.dataset import Dataset, collect
 from stad_lab.training.mdn_rnn import Latents, encode_dataset, fit_mdn_rnn, sample_latents
-from stad_lab.training.pipeline import provenance, train
+from stad_lab.training.pipeline import train
+from stad_lab.training.record import provenance
 from stad_lab.training.trainer import torch_settings
 
 STRIDES = (1, 2, 4, 8)

@@ -39,7 +39,8 @@ from stad_lab.replication.experiments import (
 from stad_lab.replication.tables import TRACKS
 from stad_lab.training.dataset import RandomDriver
 from stad_lab.training.fine_tuning import fine_tune
-from stad_lab.training.pipeline import RECORD, provenance, train
+from stad_lab.training.pipeline import train
+from stad_lab.training.record import RECORD, provenance
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE
 
 EVALUATION = "evaluation.json"

@@ -51,7 +51,8 @@ from stad_lab.replication.run import share_world_model
 from stad_lab.replication.tables import PIPELINE
 from stad_lab.training.dataset import MANIFEST, dataset_checksum, load_manifest
 from stad_lab.training.evolution import LOG, drive_group, hand_out, read_log, resume
-from stad_lab.training.pipeline import RECORD, train
+from stad_lab.training.pipeline import train
+from stad_lab.training.record import RECORD
 
 SCORE = "score.json"
 CARS = 16  # cars that drive in one batch: another number would change last bits of the returns

@@ -19,7 +19,7 @@ from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.io.files import checksum_of_tensors, load_json, load_tensors, write_bytes
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
 from stad_lab.training.evolution import fitness_curves
-from stad_lab.training.pipeline import total_budget
+from stad_lab.training.record import total_budget
 
 DATA = Path(__file__).parent / "data"
 TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer

@@ -18,7 +18,8 @@ from stad_lab.io import weights
 from stad_lab.io.files import copy_file
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE
 from stad_lab.training.evolution import evolve
-from stad_lab.training.pipeline import read_finished, run_stages
+from stad_lab.training.pipeline import run_stages
+from stad_lab.training.record import read_finished
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE, load_start, save_start
 
 FINE_TUNING = {  # what it changes in the configuration of the run that it continues from

@@ -24,11 +24,12 @@ from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.evaluation.verify import verify, verify_dataset
 from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors, write_bytes
 from stad_lab.io.workers import TaskError
-from stad_lab.training import dataset, evolution, pipeline
+from stad_lab.training import dataset, evolution, pipeline, record
 from stad_lab.training.dataset import Dataset
 from stad_lab.training.evolution import evolve
 from stad_lab.training.mdn_rnn import train_mdn_rnn
-from stad_lab.training.pipeline import STAGES, provenance, train
+from stad_lab.training.pipeline import STAGES, train
+from stad_lab.training.record import open_record, provenance, read_finished
 from stad_lab.training.vae import train_vae
 
 QUICK = Config.preset("quick")
@@ -252,7 +253,7 @@ def test_a_run_of_the_first_edition_is_refused_with_the_version_that_continues_i
     save_json(folder / "record.json", record)
     before = snapshot(folder)
     error = f"{folder} holds a run of stad_lab 0.1: continue it with that version, or choose"
-    for again in (train_again, verify, pipeline.read_finished):
+    for again in (train_again, verify, read_finished):
         with pytest.raises(ValueError, match=re.escape(error)):
             again(folder)
     assert main(["train", "quick", "--variant", "input_output", "--out", str(folder)]) == 2
@@ -263,7 +264,7 @@ def test_a_run_of_the_first_edition_is_refused_with_the_version_that_continues_i
 def test_the_record_of_a_baseline_driver_is_no_run_to_continue_or_verify(tmp_path):
     record = {"kind": "record", "variant": "random_driver", "made_with": {}, "budget": {}}
     save_json(tmp_path / "record.json", record)
-    for again in (train_again, verify, pipeline.read_finished):
+    for again in (train_again, verify, read_finished):
         with pytest.raises(ValueError, match=r"record.json is of 'random_driver', no run: choose"):
             again(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["record.json"]
@@ -622,7 +623,7 @@ def test_a_longer_run_that_was_killed_is_verified_and_is_not_finished(
     assert not failures(found)
     assert found["log of CMA-ES"] == "ok: 6 generations give the same mean"
     with pytest.raises(ValueError, match="is not finished, with 6 of 8 generations"):
-        pipeline.read_finished(run)
+        read_finished(run)
 
 
 @pytest.mark.parametrize("lost", ["vae.safetensors", "mdn_rnn.safetensors"])
@@ -646,16 +647,16 @@ def test_a_run_uses_no_network_and_writes_only_into_its_folder(quick_training):
 def test_a_commit_and_its_changes_are_those_of_the_checkout_in_which_the_library_is(
     tmp_path, monkeypatch
 ):
-    if pipeline.git("rev-parse", "HEAD") is None:
+    if record.git("rev-parse", "HEAD") is None:
         pytest.skip("this is no checkout that git reads")
     subprocess.run(["git", "init", "-q", tmp_path], check=True)
     who = ["-c", "user.name=somebody", "-c", "user.email=somebody@example.org"]
     commit = ["commit", "-q", "--allow-empty", "-m", "Begin a thesis"]
     subprocess.run(["git", "-C", tmp_path, *who, *commit], check=True)
-    for name in ("training/pipeline.py", "envs/physics.py"):
+    for name in ("training/record.py", "envs/physics.py"):
         (tmp_path / name).parent.mkdir()
-        shutil.copy(Path(pipeline.__file__).parents[1] / name, tmp_path / name)
-    monkeypatch.setattr("stad_lab.training.pipeline.__file__", str(tmp_path / name))
+        shutil.copy(Path(record.__file__).parents[1] / name, tmp_path / name)
+    monkeypatch.setattr("stad_lab.training.record.__file__", str(tmp_path / name))
     found = provenance("there")
     assert found["commit"] is None and found["uncommitted_changes"] is None
     subprocess.run(["git", "-C", tmp_path, "add", "."], check=True)  # now the library is part of it
@@ -667,7 +668,7 @@ def test_a_commit_and_its_changes_are_those_of_the_checkout_in_which_the_library
 
 def test_a_run_that_is_made_longer_has_the_new_configuration_in_its_record(quick_run):
     longer = QUICK.replace(evolution={"generations": 8})
-    assert pipeline.open_record(longer, quick_run, None, "")["config"] == longer.as_dict()
+    assert open_record(longer, quick_run, None, "")["config"] == longer.as_dict()
 
 
 def run_stage(stage, folder, executor):
@@ -689,7 +690,7 @@ def test_the_seconds_of_a_stage_are_those_of_all_its_starts(tmp_path, in_this_pr
 
 
 def test_the_seconds_of_a_stage_survive_a_kill(tmp_path, in_this_process, monkeypatch):
-    monkeypatch.setattr(pipeline, "HEARTBEAT", 0.05)
+    monkeypatch.setattr(record, "HEARTBEAT", 0.05)
     killed = []
 
     def stage(pool):

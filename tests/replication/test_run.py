@@ -19,7 +19,7 @@ from stad_lab.replication.claims import learning_curve
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS, Experiment
 from stad_lab.replication.run import EVALUATION, describe_time, keep, replicate
 from stad_lab.training.evolution import LOG
-from stad_lab.training.pipeline import RECORD, total_budget
+from stad_lab.training.record import RECORD, total_budget
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE
 
 BRIEF = {"generations": 2, "max_frames": 30}

@@ -27,7 +27,7 @@ from stad_lab.replication.study import (
 from stad_lab.replication.study_probe import probe_study
 from stad_lab.training.dataset import Dataset
 from stad_lab.training.evolution import LOG, crc
-from stad_lab.training.pipeline import RECORD
+from stad_lab.training.record import RECORD
 
 BRIEF = {"generations": 4, "max_frames": 30, "components": 8}
 CONFIG = Config.preset("quick", vae={"steps": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)

@@ -16,7 +16,8 @@ from stad_lab.io.weights import load_controller, load_world_model, save_controll
 from stad_lab.training import pipeline
 from stad_lab.training.evolution import LOG, generation_tracks
 from stad_lab.training.fine_tuning import FINE_TUNING, begin, fine_tune, fine_tuning_config
-from stad_lab.training.pipeline import ship, total_budget
+from stad_lab.training.pipeline import ship
+from stad_lab.training.record import total_budget
 from stad_lab.training.subspace import load_start, search_space
 
 BRIEF = {"generations": 2, "population": 4, "tracks": 2, "validate_every": 1}

@@ -19,7 +19,8 @@ from stad_lab.io.weights import load_controller, load_world_model, save_controll
 from stad_lab.training import pipeline, second_iteration
 from stad_lab.training.dataset import Dataset, collect, drive_randomly
 from stad_lab.training.evolution import LOG
-from stad_lab.training.pipeline import ship, total_budget, train
+from stad_lab.training.pipeline import ship, train
+from stad_lab.training.record import total_budget
 from stad_lab.training.second_iteration import (
     carry_over,
     collect_again,
