@@ -42,6 +42,7 @@ from stad_lab.training.record import (
     command_of,
     fine_tuning_command,
     open_record,
+    provenance,
     read_finished,
     timed,
 )
@@ -148,10 +149,10 @@ def run_stages(
     """Run some stages in order and keep the record of the run; False if nothing was to do."""
     worked = False
     with locked(folder):
-        command = command_of(config) if data else fine_tuning_command(config)
-        record = open_record(config, folder, before, command)
+        made = provenance(command_of(config) if data else fine_tuning_command(config))
+        record = open_record(config, folder, before, made)
         for name, stage in stages.items():
-            with timed(record, name, folder) as note:
+            with timed(record, made, name, folder) as note:
                 try:
                     with worker_threads(config.processes, executor) as pool:
                         did = stage(pool)

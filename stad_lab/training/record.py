@@ -58,13 +58,12 @@ def read_finished(earlier: Path) -> dict:
     return record
 
 
-def open_record(config: Config, folder: Path, before: dict | None, command: str) -> dict:
-    """The record of the run in `folder`, or a new one.
+def open_record(config: Config, folder: Path, before: dict | None, made: dict) -> dict:
+    """The record of the run in `folder`, or a new one that was made with `made`.
 
-    "made_with" is that of the first start; a later one on another machine or with other versions
-    is added to "continued_with". "earlier" is the record of the run that this one continues.
+    "earlier" is the record of the run that this one continues.
     """
-    path, made = folder / RECORD, provenance(command)
+    path = folder / RECORD
     new = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
     if not path.exists():
         earlier = {} if before is None else {"earlier": before}
@@ -73,10 +72,7 @@ def open_record(config: Config, folder: Path, before: dict | None, command: str)
     if (folder / VAE_FILE).exists():  # then its part of the configuration has not changed
         fixed = {name: new["config"][name] for name in ("variant", "seed", "vae")}
         check_same(path, record["config"], fixed)
-    record |= new
-    if made != starts(record)[-1]:
-        record["continued_with"] = [*starts(record)[1:], made]
-    return record
+    return record | new
 
 
 def starts(record: dict) -> list[dict]:
@@ -85,15 +81,19 @@ def starts(record: dict) -> list[dict]:
 
 
 @contextlib.contextmanager
-def timed(record: dict, stage: str, folder: Path) -> Iterator[Callable[[], None]]:
+def timed(record: dict, made: dict, stage: str, folder: Path) -> Iterator[Callable[[], None]]:
     """Yields a function that adds the time of a `with` block to the record, and writes it.
 
-    A thread calls it during a long stage, so that a killed process has left its time.
+    It also adds `made` to "continued_with", if a start on another machine or with other versions
+    did the work before. A thread calls it during a long stage, so that a killed process has left
+    its time.
     """
     before, begin, ended = record["seconds"].get(stage, 0.0), time.perf_counter(), threading.Event()
 
     def note() -> None:
         record["seconds"][stage] = before + time.perf_counter() - begin
+        if made != starts(record)[-1]:
+            record["continued_with"] = [*starts(record)[1:], made]
         save_json(folder / RECORD, record)
 
     def beat() -> None:

@@ -668,11 +668,25 @@ def test_a_commit_and_its_changes_are_those_of_the_checkout_in_which_the_library
 
 def test_a_run_that_is_made_longer_has_the_new_configuration_in_its_record(quick_run):
     longer = QUICK.replace(evolution={"generations": 8})
-    assert open_record(longer, quick_run, None, "")["config"] == longer.as_dict()
+    assert open_record(longer, quick_run, None, {})["config"] == longer.as_dict()
 
 
 def run_stage(stage, folder, executor):
     return pipeline.run_stages({"mdn_rnn": stage}, QUICK, folder, None, executor, None)
+
+
+def test_a_start_elsewhere_is_a_continuation_only_if_it_did_work(tmp_path, in_this_process):
+    file = tmp_path / "record.json"
+    run_stage(lambda _: True, tmp_path, in_this_process)
+    whole = load_json(file)
+    first = whole["made_with"] | {"commit": "an earlier one"}
+    save_json(file, whole | {"made_with": first})
+    run_stage(lambda _: False, tmp_path, in_this_process)
+    assert load_json(file) == whole | {"made_with": first}
+    for _ in range(2):
+        run_stage(lambda _: True, tmp_path, in_this_process)
+        found = load_json(file)
+        assert (found["made_with"], found["continued_with"]) == (first, [whole["made_with"]])
 
 
 def test_the_seconds_of_a_stage_are_those_of_all_its_starts(tmp_path, in_this_process):
