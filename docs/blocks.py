@@ -83,8 +83,8 @@ def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
     found = claims["study1"]["comparisons"]
     alone, both = (difference_of(found[f"{features}: input_output"]) for features in FEATURES)
-    told = f"With difference images the score changes by {alone} points without M's memory and by"
-    return f"{told} {both} points with it (95% intervals)."
+    told = f"Difference images change the score by {alone} points if the controller does not see"
+    return f"{told} M's memory, and by {both} if it does (95% intervals)."
 
 
 def verdict_figure(claims: dict) -> str:
