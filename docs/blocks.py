@@ -64,8 +64,9 @@ def finding(claims: dict) -> str:
     others = max(value for name in config.VARIANTS[:3] for value in yaw[name])
     told = " ".join(describe_verdict(claims["study1"])[:3])
     return (
-        f"{told}\n\nThe latents differ: under an agent only z of `input_output` carries how fast"
-        f" the car turns (R2 at least {min(yaw['input_output']):.2f}, others at most {others:.2f})."
+        f"{told}\n\nOnly z of `input_output` carries how fast an agent's car"
+        f" turns (R2 at least {min(yaw['input_output']):.2f}, other trained V"
+        f" at most {others:.2f})."
     )
 
 
@@ -81,10 +82,11 @@ def verdict(claims: dict) -> str:
 
 def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
-    found = claims["study1"]["comparisons"]
-    alone, both = (difference_of(found[f"{features}: input_output"]) for features in FEATURES)
-    told = f"Difference images change the score by {alone} points if the controller does not see"
-    return f"{told} M's memory, and by {both} if it does (95% intervals)."
+    comparisons, told = claims["study1"]["comparisons"], []
+    for features, memory in zip(FEATURES, ("Without M's memory", "with it"), strict=True):
+        one = comparisons[f"{features}: input_output"]
+        told.append(f"{memory} {difference_of(one)}, *{one['verdict']}*")
+    return f"How many points do difference images earn? {'; '.join(told)} (95% intervals)."
 
 
 def verdict_figure(claims: dict) -> str:
@@ -101,8 +103,9 @@ def outcomes(claims: dict) -> str:
     """The secondary outcomes of study 1, with the learning curves."""
     found = claims["study1"]
     leads = [f"{area_of(found, f, 'input_output')} if {seen}" for f, seen in SEEN.items()]
-    told = "Faster learning: over the curve, the validation mean of `input_output` less that of"
-    told += f" `frame` is {' and '.join(leads)} (95% intervals)."
+    told = "Faster learning: averaged over the curve, the validation mean of `input_output` less"
+    told += f" that of `frame` is {' and '.join(leads)} (95% intervals). A higher curve need not be"
+    told += " a faster one."
     curves = image("study1_curves", claims)
     return "\n\n".join([told, outcomes_table(found), curves])
 
@@ -118,7 +121,7 @@ def comparisons_table(study: dict) -> str:
             p = [p_value(one[key]) for key in ("p", "holm_p")]
             outcome = one["verdict"]
             if outcome == "undecided":
-                outcome += f": {one['seeds_that_decide']} seeds would decide"
+                outcome += f" ({one['seeds_that_decide']} seeds)"
             name = f"`{variant}`, {SEEN[features]}"
             pipelines = str(len(one["by_seed"]))
             scatter = f"{one['deviation']:.0f}"

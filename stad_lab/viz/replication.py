@@ -35,19 +35,20 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
     Args:
         comparisons: "FEATURES: VARIANT" -> "difference", "interval", "by_seed" and "verdict".
         margin: differences within +-margin, in points, are not relevant.
-        reported: the gain that the paper reports, in points.
+        reported: the gain of `input_output` that the paper reports, in points.
     """
     variants = [variant for variant in COLOURS if variant != "frame"]
     figure, axes = new_figure(8.0, 4.6, 2, 1, sharex=True)
     for axis, (features, title) in zip(axes[:, 0], SEEN.items(), strict=True):
         axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
         axis.axvline(0, color="black", linewidth=0.8)
-        axis.axvline(reported, color="black", linestyle="--", label=f"paper: {reported:+.0f}")
+        paper = f"paper, input_output: {reported:+.0f}"
+        axis.axvline(reported, color="black", linestyle="--", label=paper)
         for height, variant in enumerate(variants):
             plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
         name_rows(axis, variants)
         axis.set_title(title, loc="left", fontsize=10)
-    axes[1, 0].set_xlabel("difference of the mean return to frame of the same seed, points")
+    axes[1, 0].set_xlabel("mean return less that of frame with the same seed, points")
     handles = {name: one for one, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=9)
     told = [
@@ -57,8 +58,8 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
         for one in [comparisons[f"{features}: {variant}"]]
     ]
     pairs = len(comparisons["z: input"]["by_seed"])
-    lead = f"Mean differences with 95% intervals, and a dot for each of {pairs} seeds: "
-    return describe(figure, "Study 1: variants less frame", lead, ["; ".join(told)])
+    lead = f"Mean differences with 95% intervals, and a circle for each of {pairs} seeds: "
+    return describe(figure, "Study 1: points more or less than frame", lead, ["; ".join(told)])
 
 
 def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:

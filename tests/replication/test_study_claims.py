@@ -174,10 +174,10 @@ def test_the_pages_have_every_result_of_the_study(found):
         start = f"`{variant}`, {blocks.SEEN[features]} |"
         line = next(line for line in page.splitlines() if start in line)
         p = blocks.p_value(one["holm_p"])
-        assert blocks.difference_of(one) in line and f"| {p} | {one['verdict']} |" in line
+        assert blocks.difference_of(one) in line and f"| {p} | {one['verdict']}" in line
     gain = blocks.difference_of(found["comparisons"]["z: input_output"])
-    assert f"by {gain} points if" in blocks.gains(claims)
-    assert blocks.verdict(claims).count("\n- ") == 3
+    assert f"memory {gain}, *gain*; with it" in blocks.gains(claims)
+    assert blocks.verdict(claims).count("\n- ") == 4
     assert "](../notebooks/pictures/study1.png)" in page
     assert "](notebooks/pictures/study1.png)" in blocks.verdict_figure(claims)
     assert "](../notebooks/pictures/study1_curves.png)" in blocks.outcomes(claims)

@@ -26,7 +26,7 @@ def comparisons():
     }
 
 
-def test_the_forest_plot_has_a_dot_for_each_pipeline_and_a_line_at_the_gain_of_the_paper(
+def test_the_forest_plot_has_a_circle_for_each_pipeline_and_a_line_at_the_gain_of_the_paper(
     comparisons,
 ):
     figure = plot_study(comparisons, MARGIN, 75.0)
@@ -37,7 +37,7 @@ def test_the_forest_plot_has_a_dot_for_each_pipeline_and_a_line_at_the_gain_of_t
             assert one["by_seed"] in drawn and one["interval"] in drawn
         assert [75, 75] in drawn
     label = figure.get_label()
-    assert "a dot for each of 4 seeds" in label
+    assert "a circle for each of 4 seeds" in label
     assert "C sees z and h, input_output +50.0 (42.0 to 58.0), undecided" in label
 
 
