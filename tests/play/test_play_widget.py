@@ -1,6 +1,6 @@
 """The driving widget without a browser: buttons, held pedals and the loop.
 
-How keys reach it is tested in test_keys_in_browser.py.
+How keys reach it is tested in test_browser.py.
 """
 
 import threading
