@@ -43,6 +43,14 @@ import live_build  # noqa: E402
 torch.set_num_threads(1)  # the models here are tiny
 
 
+def pytest_xdist_auto_num_workers():
+    """One process more than cores, because many tests wait for a browser, a kernel or a command.
+
+    There are at most 4: a laptop's memory holds no more.
+    """
+    return min(4, os.cpu_count() + 1)
+
+
 def run_stad_lab(*arguments, **environment):
     """Run the real command line in a process of its own."""
     command = [sys.executable, "-m", "stad_lab", *map(str, arguments)]
