@@ -264,8 +264,8 @@ def check_accessible(files, browser):
 
 # In the suite axe checks what is built differently; the other pages are in the long tests.
 KINDS = (
-    "docs/index", "docs/live/*", "README", "docs/results", "docs/speed", "docs/glossary",
-    "docs/modules/*agent", "notebooks/00_small", "notebooks/exercises/01*", "**/frame/README",
+    "docs/index", "docs/live/*", "README", "docs/results", "docs/modules/*agent",
+    "notebooks/00_small", "notebooks/exercises/01*", "**/frame/README",
 )  # fmt: skip
 
 
