@@ -50,7 +50,8 @@ def fixed(value: float) -> str:
 
 def paper_table(claims: dict) -> str:
     """What the paper reports."""
-    sees = ("frame", "both", "frame", "both"), ("frame", "frame", "both", "both")
+    both = "frame, difference"
+    sees = ("frame", both, "frame", both), ("frame", "frame", both, both)
     lines = [
         (f"`{variant}`", *seen, f"{score:.0f}")
         for (variant, score), *seen in zip(PAPER.items(), *sees, strict=True)
@@ -64,9 +65,8 @@ def finding(claims: dict) -> str:
     others = max(value for name in config.VARIANTS[:3] for value in yaw[name])
     told = " ".join(describe_verdict(claims["study1"])[:3])
     return (
-        f"{told}\n\nOnly z of `input_output` carries how fast an agent's car"
-        f" turns (R2 at least {min(yaw['input_output']):.2f}, other trained V"
-        f" at most {others:.2f})."
+        f"{told}\n\nThe yaw rate can be read from z of `input_output` (R2 at least"
+        f" {min(yaw['input_output']):.2f}, others at most {others:.2f}), or from any z with h."
     )
 
 
@@ -83,10 +83,11 @@ def verdict(claims: dict) -> str:
 def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
     comparisons, told = claims["study1"]["comparisons"], []
-    for features, memory in zip(FEATURES, ("Without M's memory", "with it"), strict=True):
+    asked = "What do difference images earn, if the agent both sees and reconstructs them?"
+    for features, memory in zip(FEATURES, ("Without its memory", "with it"), strict=True):
         one = comparisons[f"{features}: input_output"]
         told.append(f"{memory} {difference_of(one)}, *{one['verdict']}*")
-    return f"How many points do difference images earn? {'; '.join(told)} (95% intervals)."
+    return f"{asked} {'; '.join(told)} (95% intervals)."
 
 
 def verdict_figure(claims: dict) -> str:
