@@ -83,7 +83,7 @@ def verdict(claims: dict) -> str:
 def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
     comparisons, told = claims["study1"]["comparisons"], []
-    asked = "What do difference images earn, if the agent both sees and reconstructs them?"
+    asked = "How many points do difference images earn, if the agent reconstructs them, too?"
     for features, memory in zip(FEATURES, ("Without its memory", "with it"), strict=True):
         one = comparisons[f"{features}: input_output"]
         told.append(f"{memory} {difference_of(one)}, *{one['verdict']}*")
