@@ -65,8 +65,8 @@ def finding(claims: dict) -> str:
     others = max(value for name in config.VARIANTS[:3] for value in yaw[name])
     told = " ".join(describe_verdict(claims["study1"])[:3])
     return (
-        f"{told}\n\nThe yaw rate can be read from z of `input_output` (R2 at least"
-        f" {min(yaw['input_output']):.2f}, others at most {others:.2f}), or from any z with h."
+        f"{told}\n\nUnder an agent the yaw rate is readable from z of `input_output` (R2 at least"
+        f" {min(yaw['input_output']):.2f}, others at most {others:.2f}), or any z with h."
     )
 
 
@@ -83,7 +83,7 @@ def verdict(claims: dict) -> str:
 def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
     comparisons, told = claims["study1"]["comparisons"], []
-    asked = "How many points do difference images earn, if the agent reconstructs them, too?"
+    asked = "How many points do difference images earn, if the agent sees and reconstructs them?"
     for features, memory in zip(FEATURES, ("Without its memory", "with it"), strict=True):
         one = comparisons[f"{features}: input_output"]
         told.append(f"{memory} {difference_of(one)}, *{one['verdict']}*")

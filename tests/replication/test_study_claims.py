@@ -174,7 +174,7 @@ def test_the_pages_have_every_result_of_the_study(found):
         start = f"`{variant}`, {blocks.SEEN[features]} |"
         line = next(line for line in page.splitlines() if start in line)
         p = blocks.p_value(one["holm_p"])
-        assert blocks.difference_of(one) in line and f"| {p} | {one['verdict']}" in line
+        assert blocks.difference_of(one) in line and f"| {p} | {one['verdict']} |" in line
     gain = blocks.difference_of(found["comparisons"]["z: input_output"])
     assert f"memory {gain}, *gain*; with it" in blocks.gains(claims)
     assert blocks.verdict(claims).count("\n- ") == 4

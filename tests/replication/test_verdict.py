@@ -47,7 +47,7 @@ def test_every_pair_of_verdicts_has_a_meaning_for_the_claim(words):
         verdict = word.removeprefix("small ").removeprefix("large ").partition(",")[0]
         assert f"*{verdict}*" in sentence and f"{low:.1f} to {high:.1f}" in sentence
         assert ("trails" in sentence) == (low + high < 0)
-        assert ("121 seeds" in sentence) == (verdict == "undecided")
+        assert ("121 seeds would decide" in sentence) == (verdict == "undecided")
         assert effect in meaning
     assert ("whatever C sees" in meaning) == (words[0] == words[1])
 
@@ -65,4 +65,5 @@ def test_the_finding_of_the_overview_has_at_most_120_words_for_every_pair():
 def test_the_gain_of_the_paper_is_placed_by_each_interval():
     gain = describe_verdict(study_with(("gain", "harm")))[-1]
     assert "within the interval for z alone and above that for z and h" in gain
-    assert "lie above both intervals" in describe_verdict(study_with(["harm"] * 2))[-1]
+    harm = describe_verdict(study_with(["harm"] * 2))[-1]
+    assert "75 points that the paper reports for `input_output` lie above both intervals" in harm
