@@ -87,11 +87,14 @@ class Agent:
             self.cars, self.state = np.arange(len(frames)), self._no_memory(len(frames))
         self.latents = self.inference.encode(frames, self.memory.push(frames))
         self.hidden = self.state[0]
-        features = np.concatenate([self.latents, self.hidden], axis=1)
-        actions = control(self.present_parameters(), features)
+        actions = control(self.present_parameters(), self.features())
         if self.remembers:
             self.remember(actions, self.state)
         return actions
+
+    def features(self) -> np.ndarray:
+        """What C sees: z and h side by side, float32 (cars, latent_size + hidden_size)."""
+        return np.concatenate([self.latents, self.hidden], axis=1)
 
     def remember(self, actions: np.ndarray, before: np.ndarray | None) -> None:
         """Update M's memory with the last z and these actions, float32 (cars, 3).

@@ -39,8 +39,7 @@ def probe(
     """
     check_rows(features, targets, episodes)
     rng = np.random.default_rng(seed)
-    names = rng.permutation(np.unique(episodes))
-    first, others = np.split(names, [round(HELDOUT * len(names))])
+    first, others = split_episodes(episodes, rng)
     heldout = np.isin(episodes, first)
     trial = np.isin(episodes, others[: max(1, round(TRIAL * len(others)))])
     penalties = choose_penalties(features, targets, ~heldout & ~trial, trial)
@@ -51,6 +50,12 @@ def probe(
     again = np.array([r2_of_sums(sums[resample]) for resample in chosen])
     low, high = np.percentile(again, [2.5, 97.5], axis=0)
     return {"r2": r2_of_sums(sums), "low": low, "high": high}
+
+
+def split_episodes(episodes: np.ndarray, rng: np.random.Generator) -> list[np.ndarray]:
+    """The episodes that are held out, and the others, in random order."""
+    names = rng.permutation(np.unique(episodes))
+    return np.split(names, [round(HELDOUT * len(names))])
 
 
 def choose_penalties(

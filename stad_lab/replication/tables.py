@@ -26,6 +26,7 @@ TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's re
 UNITS = ("agents", "episodes", "frames")
 RUN = ["experiment", "role", "seed"]
 PIPELINE = ["study", "variant", "features", "seed"]
+SENSED = ["seed", "variant", "sees", "repeat"]  # names a run of study 5
 TABLES = {  # name -> columns that name a line, and others that each line must have
     "episodes": (["experiment", "seed", "track"], ["return", "frames"]),
     "fast_episodes": (["agent", "processor", "track"], ["return", "frames"]),
@@ -42,6 +43,8 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
     "study_runs": (
         PIPELINE, ["processor", "world_model.trained_on", "dataset", "kept_controller"],
     ),
+    "study5_runs": (SENSED, ["mean", "processor", "controller"]),
+    "study5_returns": (SENSED, ["1000"]),
     "study_probe": ([*PIPELINE, "trained", "driver", "quantity"], ["r2"]),
 }  # fmt: skip
 
@@ -60,10 +63,15 @@ def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
 
 def read_study(name: str, folder: Path = DATA) -> pandas.DataFrame:
     """The table "episodes", "generations", "runs" or "probe" of the studies, empty if not there."""
-    if not (folder / f"study_{name}.csv").exists():
-        keys, values = TABLES[f"study_{name}"]
+    return read_or_empty(f"study_{name}", folder)
+
+
+def read_or_empty(name: str, folder: Path = DATA) -> pandas.DataFrame:
+    """Read a table, which is empty if its file is not there."""
+    if not (folder / f"{name}.csv").exists():
+        keys, values = TABLES[name]
         return pandas.DataFrame(columns=[*keys, *values])
-    return read(f"study_{name}", folder)
+    return read(name, folder)
 
 
 def episodes(folder: Path = DATA) -> pandas.DataFrame:
@@ -167,7 +175,7 @@ def add_log(run: dict, log: list[dict], to: Path) -> None:
 
 def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
     """Write a table with new lines in the place of those of the same run or pipeline."""
-    run = [column for column in TABLES[name][0] if column in (*RUN, *PIPELINE)]
+    run = [column for column in TABLES[name][0] if column in (*RUN, *PIPELINE, *SENSED)]
     if (folder / f"{name}.csv").exists():
         old = read(name, folder)
         new = pandas.MultiIndex.from_frame(lines[run])

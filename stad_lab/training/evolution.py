@@ -12,13 +12,13 @@ import zlib
 from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
-from stad_lab.agent import Agent, drive
+from stad_lab.agent import Agent, Episodes, drive
 from stad_lab.config import STREAMS, Config, EvolutionConfig, check_same, track_seeds
 from stad_lab.io import weights
 from stad_lab.io.files import load_json, locked, save_json
@@ -37,13 +37,23 @@ REMEMBERED, RESTING = 20, 4
 Watch = Callable[[list[dict]], None]
 
 
+class Drives(Protocol):
+    """What drives in place of V, M and C of a world model, for example with another view of z."""
+
+    sizes: tuple[int, int]  # how many numbers z has, and how many C sees beside it
+    checksums: dict[str, str]  # what a log and a controller must belong to
+
+    def drive(self, parameters: np.ndarray, tracks: list[int], **limits) -> Episodes:
+        """Drive one episode on each track with a row of `parameters` for each."""
+
+
 @dataclasses.dataclass
 class Evolution:
     """A CMA-ES run: its configuration, its log, and the state that follows from the log."""
 
     config: Config
     folder: Path
-    world_model: WorldModel
+    world_model: WorldModel | Drives
     space: SearchSpace
     log: dict
     strategy: "Strategy"
@@ -55,7 +65,11 @@ class Evolution:
 
 
 def evolve(
-    config: Config, folder: Path, executor: Executor | None = None, watch: Watch | None = None
+    config: Config,
+    folder: Path,
+    executor: Executor | None = None,
+    watch: Watch | None = None,
+    drives: Drives | None = None,
 ) -> bool:
     """Evolve C for the V and M in `folder`; False if the run was complete already.
 
@@ -66,6 +80,7 @@ def evolve(
     Args:
         executor: who drives; None for `config.processes` threads of this machine.
         watch: called with the log's generations after each, and when a run is resumed.
+        drives: what drives instead of the V and M in `folder`; on this machine alone.
 
     Raises:
         ValueError: a file in `folder` is damaged or of another run, or an action is not finite.
@@ -73,7 +88,7 @@ def evolve(
         TaskError: an episode failed, or no worker answers.
     """
     folder, settings = Path(folder), config.evolution
-    world_model = load_world_model(folder)
+    world_model = drives or load_world_model(folder)
     log = read_log(config, folder, world_model)
     kept, done = kept_generation(folder, log), len(log["generations"])
     if watch and done:
@@ -86,7 +101,7 @@ def evolve(
         if chosen and kept != chosen:
             keep_controller(run, run.controller(chosen))
         with worker_threads(config.processes, executor) as executor:
-            source = hand_out(executor, folder)
+            source = drives or hand_out(executor, folder)
             label = f"evolve C ({config.variant})"
             bar = tqdm(range(done, settings.generations), label, settings.generations, initial=done)
             for _ in bar:
@@ -339,7 +354,7 @@ def drive_parallel(
 
 
 def drive_group(
-    source: Path | WorldModel,
+    source: Path | WorldModel | Drives,
     parameters: np.ndarray,
     tracks: list[int],
     fast: bool = True,
@@ -347,7 +362,10 @@ def drive_group(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive a group of cars: (returns, lengths). Runs in a worker."""
     single_thread()
-    episodes = drive(make_agent(source, parameters), tracks, fast, **limits or {})
+    if hasattr(source, "drive"):
+        episodes = source.drive(parameters, tracks, **limits or {})
+    else:
+        episodes = drive(make_agent(source, parameters), tracks, fast, **limits or {})
     return episodes.returns, episodes.lengths
 
 

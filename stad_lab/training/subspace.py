@@ -91,11 +91,15 @@ def find_components(config: Config, dataset: Callable[[], Dataset], folder: Path
     episodes = zip(tqdm(data.frames, "components", unit="episode"), data.actions, strict=True)
     seen = (features_of(world_model, *episode) for episode in episodes)
     columns = seen_columns(config.evolution.features, *world_model.sizes)
-    middle, components = principal_components(seen, columns, count)
-    tensors = {"middle": torch.from_numpy(middle), "components": torch.from_numpy(components)}
-    metadata = {"kind": "components", "variant": config.variant, **depends_on}
-    save_tensors(path, tensors, **metadata, **world_model.checksums)
+    found = principal_components(seen, columns, count)
+    save_components(path, *found, variant=config.variant, **depends_on, **world_model.checksums)
     return True
+
+
+def save_components(path: Path, middle: np.ndarray, components: np.ndarray, **metadata) -> None:
+    """Write what `principal_components` found."""
+    tensors = {"middle": torch.from_numpy(middle), "components": torch.from_numpy(components)}
+    save_tensors(path, tensors, kind="components", **metadata)
 
 
 def principal_components(
