@@ -19,12 +19,14 @@ from stad_lab.replication.claims import PAPER
 from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
 from stad_lab.replication.verdict import PAPER_GAIN, describe_verdict
 from stad_lab.viz.replication import (
+    DRIVERS,
     SEEN,
     SOURCES,
     TURNING,
     difference_of,
     plot_learning_curves,
     plot_representation,
+    plot_scores,
     plot_study,
 )
 
@@ -84,7 +86,7 @@ def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
     comparisons, told = claims["study1"]["comparisons"], []
     asked = "How many points do difference images earn, if the agent sees and reconstructs them?"
-    for features, memory in zip(FEATURES, ("Without its memory", "with it"), strict=True):
+    for features, memory in zip(SEEN, ("With its memory", "without it"), strict=True):
         one = comparisons[f"{features}: input_output"]
         told.append(f"{memory} {difference_of(one)}, *{one['verdict']}*")
     return f"{asked} {'; '.join(told)} (95% intervals)."
@@ -96,8 +98,24 @@ def verdict_figure(claims: dict) -> str:
 
 
 def study1(claims: dict) -> str:
-    """The tests of study 1, and the forest plot."""
-    return f"{comparisons_table(claims['study1'])}\n\n{image('study1', claims)}"
+    """The forest plot of study 1, its tests, and the score of every pipeline."""
+    parts = image("study1", claims), comparisons_table(claims["study1"])
+    return "\n\n".join([*parts, image("study1_scores", claims)])
+
+
+def afterwards(claims: dict) -> str:
+    """The comparisons that were computed after study 1."""
+    names = {"interaction": "`input_output` - `frame`: with z, less the same with z and h"}
+    for features, seen in SEEN.items():
+        names[f"{features}: input_output less input"] = f"`input_output` - `input`, {seen}"
+    names["input_output less input"] = "`input_output` - `input`, mean of both C"
+    lines = []
+    for name, title in names.items():
+        one = claims["study1"]["afterwards"][name]
+        low, high = one["t_interval"]
+        cells = difference_of(one), f"{low:.1f} to {high:.1f}", p_value(one["p"])
+        lines.append((title, *cells))
+    return table(("comparison", "difference (95% interval)", "t-interval", "p"), lines)
 
 
 def outcomes(claims: dict) -> str:
@@ -115,22 +133,17 @@ def comparisons_table(study: dict) -> str:
     """The tests of study 1."""
     lines = []
     for family, variants in FAMILIES.items():
-        for features, variant in itertools.product(FEATURES, variants):
-            arm = f"{features}: {variant}"
-            one, arms = study["comparisons"][arm], study["arms"]
-            means = [f"{arms[name]['mean']:.0f}" for name in (f"{features}: frame", arm)]
-            p = [p_value(one[key]) for key in ("p", "holm_p")]
+        for features, variant in itertools.product(SEEN, variants):
+            one = study["comparisons"][f"{features}: {variant}"]
+            low, high = one["t_interval"]
             outcome = one["verdict"]
             if outcome == "undecided":
                 outcome += f" ({one['seeds_that_decide']} seeds)"
-            name = f"`{variant}`, {SEEN[features]}"
-            pipelines = str(len(one["by_seed"]))
-            scatter = f"{one['deviation']:.0f}"
-            cells = (family, name, pipelines, *means, difference_of(one), scatter, *p, outcome)
-            lines.append(cells)
-    head = ("test", "arm", "pairs", "mean of `frame`", "mean of the arm")
-    head += ("difference (95% interval)",)
-    return table((*head, "SD of pairs", "p", "Holm's p", "verdict"), lines)
+            cells = (family, f"`{variant}`, {SEEN[features]}", difference_of(one))
+            cells += (f"{low:.1f} to {high:.1f}", f"{one['deviation']:.0f}")
+            lines.append((*cells, *(p_value(one[key]) for key in ("p", "holm_p")), outcome))
+    head = ("test", "arm less `frame`", "difference (95% interval)", "t-interval", "SD of pairs")
+    return table((*head, "p", "Holm's p", "verdict"), lines)
 
 
 def p_value(p: float) -> str:
@@ -141,7 +154,7 @@ def p_value(p: float) -> str:
 def outcomes_table(study: dict) -> str:
     """The secondary outcomes of the arms of study 1."""
     lines = []
-    for features, variant in itertools.product(FEATURES, config.VARIANTS):
+    for features, variant in itertools.product(SEEN, config.VARIANTS):
         one = study["arms"][f"{features}: {variant}"]
         points = ("interquartile_mean", "tenth_percentile", "minimum", "area")
         scores = [f"{one[key]:.0f}" for key in points]
@@ -149,8 +162,7 @@ def outcomes_table(study: dict) -> str:
         name = f"`{variant}`, {SEEN[features]}"
         lines.append((name, f"{one['below_800']:.1%}", *scores, lead))
     head = ("arm", "below 800", "interquartile mean", "10th percentile", "minimum")
-    area = "area under the learning curve"
-    return table((*head, area, "difference of the area to `frame` (95% interval)"), lines)
+    return table((*head, "area", "area less that of `frame`"), lines)
 
 
 def area_of(study: dict, features: str, variant: str) -> str:
@@ -170,12 +182,13 @@ def study3(claims: dict, driver: str) -> str:
 
 
 def turning_table(claims: dict) -> str:
-    """R2 from z of what a single frame does not show, while an agent drives."""
+    """R2 from z of what a single frame does not show, and of the yaw rate with both drivers."""
     lines = []
     for name in (*config.VARIANTS, "input_output, untrained"):
-        found = claims["study3"][f"agent: {name}"]["z"]
-        lines.append([network(name), *(r2_cell(found[quantity]) for quantity in TURNING)])
-    return table(("V", *TURNING), lines)
+        agent, random = (claims["study3"][f"{one}: {name}"]["z"] for one in DRIVERS)
+        cells = [r2_cell(agent[quantity]) for quantity in TURNING]
+        lines.append([network(name), *cells, r2_cell(random["yaw rate"])])
+    return table(("V", *TURNING, "yaw rate, random driver"), lines)
 
 
 def network(name: str) -> str:
@@ -192,7 +205,8 @@ def r2_cell(one: dict) -> str:
 
 FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claims.json
     "study1": lambda claims: plot_study(claims["study1"]["comparisons"], MARGIN, PAPER_GAIN),
-    "study1_curves": lambda claims: plot_learning_curves(claims["study1"]["curves"]),
+    "study1_scores": lambda claims: plot_scores(claims["study1"]["arms"]),
+    "study1_curves": lambda claims: plot_learning_curves(claims["study1"]["curve_differences"]),
     "study3": lambda claims: plot_representation(claims["study3"]),
     "study3_random": lambda claims: plot_representation(claims["study3"], "random_driver"),
 }
@@ -408,6 +422,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "gains": gains,
     "verdict's figure": verdict_figure,
     "study1": study1,
+    "afterwards": afterwards,
     "outcomes": outcomes,
     "turning": turning_table,
     "study3, agent": lambda claims: study3(claims, "agent"),

@@ -22,7 +22,7 @@ LEVEL = 0.05  # of Holm's p
 
 
 def describe_study1(folder: Path = tables.DATA, study: str = "study1") -> dict:
-    """Progress; and once all seeds are complete "arms", "comparisons" and "curves".
+    """Progress; and once all seeds are complete arms, comparisons, curves, and "afterwards".
 
     An arm or comparison is named by features and variant: "z: input_output".
     """
@@ -38,7 +38,9 @@ def describe_study1(folder: Path = tables.DATA, study: str = "study1") -> dict:
         comparisons |= compare_family(returns, areas, variants)
     arms = {arm: describe_arm(own, areas[arm]) for arm, own in returns.items()}
     bands = {arm: mean_curve(*curve) for arm, curve in curves.items()}
-    return found | {"arms": arms, "comparisons": comparisons, "curves": bands}
+    afterwards = compare_afterwards(returns)
+    found |= {"arms": arms, "comparisons": comparisons, "afterwards": afterwards}
+    return found | {"curves": bands, "curve_differences": curve_differences(curves)}
 
 
 def describe_progress(planned: Study, runs: pandas.DataFrame) -> dict:
@@ -98,15 +100,33 @@ def compare_family(
 
 
 def compare(frame: np.ndarray, variant: np.ndarray) -> dict:
-    """The difference of two arms (seeds, tracks) on the same seeds and tracks."""
+    """The difference of two arms (seeds, tracks) on the same seeds and tracks.
+
+    "interval" is of the bootstrap, "t_interval" Student's over seeds.
+    """
     differences = variant - frame
     by_seed = differences.mean(axis=1)
     return {
         "difference": float(differences.mean()),
         "interval": statistics.bootstrap(differences),
+        "t_interval": statistics.mean_interval(by_seed),
         "by_seed": by_seed.tolist(),
         "p": statistics.paired_p(by_seed),
     }
+
+
+def compare_afterwards(returns: dict[str, np.ndarray]) -> dict[str, dict]:
+    """Comparisons that the protocol of study 1 does not have, computed after its results."""
+    gain = {one: returns[f"{one}: input_output"] - returns[f"{one}: frame"] for one in FEATURES}
+    found = {"interaction": compare(gain["z, h"], gain["z"])}
+    for features in FEATURES:
+        pair = (returns[f"{features}: {variant}"] for variant in ("input", "input_output"))
+        found[f"{features}: input_output less input"] = compare(*pair)
+    both = (
+        np.mean([returns[f"{one}: {variant}"] for one in FEATURES], axis=0)
+        for variant in ("input", "input_output")
+    )
+    return found | {"input_output less input": compare(*both)}
 
 
 def find_verdict(interval: list[float], holm_p: float) -> str:
@@ -165,6 +185,16 @@ def mean_curve(episodes: np.ndarray, scores: np.ndarray) -> dict[str, list[float
     found = {"episodes": episodes.mean(axis=0), "mean": scores.mean(axis=0)}
     found |= {"low": low, "high": high}
     return {name: np.round(values, 1).tolist() for name, values in found.items()}
+
+
+def curve_differences(curves: dict[str, tuple]) -> dict[str, dict[str, list[float]]]:
+    """Learning curves less that of `frame` of the same seed: as `mean_curve`, for each arm."""
+    found = {}
+    for arm, (episodes, scores) in curves.items():
+        baseline = curves[f"{arm.partition(': ')[0]}: frame"][1]
+        if not arm.endswith(": frame"):
+            found[arm] = mean_curve(episodes, scores - baseline)
+    return found
 
 
 def describe_study3(folder: Path = tables.DATA, study: str = "study1") -> dict:

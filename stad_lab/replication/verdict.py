@@ -4,23 +4,22 @@ Every sentence follows from the comparisons of `stad_lab.replication.study_claim
 """
 
 from stad_lab.replication.claims import PAPER
-from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
+from stad_lab.replication.study_claims import FAMILIES, LEVEL, MARGIN
 
 PAPER_GAIN = PAPER["input_output"] - PAPER["frame"]
-SEES = {"z": "z alone", "z, h": "z and h"}
-ORDER = ("gain", "harm", "no relevant gain", "undecided")  # which verdict the sentence names first
+SEES = {"z, h": "z and h", "z": "z alone"}  # as in the paper, and a diagnostic
 
 
 def describe_verdict(study: dict) -> list[str]:
-    """Five sentences: the verdict for both C, what it means, the secondary ones, the paper's gain.
+    """Six sentences: both verdicts, what they mean, the secondary ones, and the paper's gain.
 
     Args:
         study: what `describe_study1` returns after the last pipeline.
     """
-    primary = {features: study["comparisons"][f"{features}: input_output"] for features in FEATURES}
+    primary = {features: study["comparisons"][f"{features}: input_output"] for features in SEES}
     told = [describe_comparison(features, one) for features, one in primary.items()]
-    told += [describe_meaning(primary), describe_secondary(study["comparisons"])]
-    return [*told, describe_paper_gain(primary)]
+    told += [describe_interaction(study["afterwards"]["interaction"]), describe_meaning(primary)]
+    return [*told, describe_secondary(study["comparisons"]), describe_paper_gain(primary)]
 
 
 def describe_comparison(features: str, one: dict) -> str:
@@ -34,13 +33,19 @@ def describe_comparison(features: str, one: dict) -> str:
     return text + "."
 
 
+def describe_interaction(one: dict) -> str:
+    """Whether the two effects differ; the protocol has no such test."""
+    differ = "differ" if one["p"] < LEVEL else "do not differ significantly"
+    text = f"Computed afterwards: the two effects {differ}"
+    return f"{text} (by {one['difference']:.1f} points, p = {one['p']:.3f})."
+
+
 def describe_meaning(primary: dict[str, dict]) -> str:
-    """What the verdicts for z, and for z and h, say of `input_output`."""
-    first, second = sorted(FEATURES, key=lambda one: ORDER.index(primary[one]["verdict"]))
-    effects = describe_effect(primary[first]), describe_effect(primary[second])
-    if effects[0] == effects[1]:
-        return f"So {effects[0]}, whatever C sees."
-    return f"So if C sees {SEES[first]}, {effects[0]}; if it sees {SEES[second]}, {effects[1]}."
+    """What the verdicts mean for a C that sees z and h, and for one that sees z alone."""
+    both, alone = (describe_effect(primary[features]) for features in SEES)
+    if both == alone:
+        return f"So {both}, whatever C sees."
+    return f"So if C sees z and h, as in the paper, {both}; if it sees z alone, {alone}."
 
 
 def describe_effect(one: dict) -> str:
@@ -51,7 +56,7 @@ def describe_effect(one: dict) -> str:
     if one["verdict"] == "harm":
         return "`input_output` lowers the score" + describe_size(-high, -low)
     if one["verdict"] == "no relevant gain":
-        return f"the interval excludes a gain of {MARGIN} points"
+        return f"`input_output` gains at most about {max(high, 0):.0f} points"
     below = f", but is below {MARGIN} points"
     return "the effect of `input_output` stays open" + below * (high < MARGIN)
 
@@ -66,23 +71,23 @@ def describe_size(least: float, most: float) -> str:
 def describe_secondary(comparisons: dict[str, dict]) -> str:
     """The verdicts of the secondary comparisons."""
     told = []
-    for features in FEATURES:
+    for features, name in SEES.items():
         verdicts = [
             f"`{variant}` *{comparisons[f'{features}: {variant}']['verdict']}*"
             for variant in FAMILIES["secondary"]
         ]
-        told.append(f"with {SEES[features]}, {', '.join(verdicts)}")
+        told.append(f"with {name}, {', '.join(verdicts)}")
     return f"The secondary verdicts are: {'; '.join(told)}."
 
 
 def describe_paper_gain(primary: dict[str, dict]) -> str:
     """Where the paper's gain lies, and that its conditions were others."""
     places = []
-    for features in FEATURES:
-        low, high = primary[features]["interval"]
+    for one in primary.values():
+        low, high = one["interval"]
         places.append("below" if low > PAPER_GAIN else "above" if high < PAPER_GAIN else "within")
-    where = f"{places[0]} both intervals"
+    where, (first, second) = f"{places[0]} both intervals", SEES.values()
     if places[0] != places[1]:
-        where = f"{places[0]} the interval for z alone and {places[1]} that for z and h"
+        where = f"{places[0]} the interval for {first} and {places[1]} that for {second}"
     text = f"The {PAPER_GAIN:.0f} points that the paper reports for `input_output` lie {where};"
     return f"{text} they were measured on CarRacing-v0 with another recipe."

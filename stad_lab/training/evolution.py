@@ -362,10 +362,10 @@ def drive_group(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive a group of cars: (returns, lengths). Runs in a worker."""
     single_thread()
-    if hasattr(source, "drive"):
-        episodes = source.drive(parameters, tracks, **limits or {})
-    else:
+    if isinstance(source, Path | WorldModel):
         episodes = drive(make_agent(source, parameters), tracks, fast, **limits or {})
+    else:
+        episodes = source.drive(parameters, tracks, **limits or {})
     return episodes.returns, episodes.lengths
 
 

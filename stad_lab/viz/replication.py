@@ -17,7 +17,7 @@ from stad_lab.viz.plots import (
 )
 
 COLOURS = {"frame": "#555555", "input": BLUE, "output": RED, "input_output": GREEN}
-SEEN = {"z": "C sees z", "z, h": "C sees z and h"}
+SEEN = {"z, h": "C sees z and h", "z": "C sees z"}
 DRIVERS = {"agent": "an agent", "random_driver": "the random driver"}
 SOURCES = {"z": "z", "z, h": "z and h"}
 TURNING = ("slip speed", "yaw rate", "wheel angle")  # what a single frame does not show
@@ -42,8 +42,9 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
     for axis, (features, title) in zip(axes[:, 0], SEEN.items(), strict=True):
         axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
         axis.axvline(0, color="black", linewidth=0.8)
-        paper = f"paper, input_output: {reported:+.0f}"
-        axis.axvline(reported, color="black", linestyle="--", label=paper)
+        if features == "z, h":  # what the paper's C sees
+            paper = f"paper, input_output: {reported:+.0f}"
+            axis.axvline(reported, color="black", linestyle="--", label=paper)
         for height, variant in enumerate(variants):
             plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
         name_rows(axis, variants)
@@ -51,15 +52,14 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
     axes[1, 0].set_xlabel("mean return less that of frame with the same seed, points")
     handles = {name: one for one, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=9)
-    told = [
-        f"{SEEN[features]}, {variant} {difference_of(one)}, {one['verdict']}"
-        for features in SEEN
-        for variant in variants
-        for one in [comparisons[f"{features}: {variant}"]]
-    ]
+    told = []
+    for features, seen in SEEN.items():
+        named = ((variant, comparisons[f"{features}: {variant}"]) for variant in variants)
+        cells = (f"{name} {difference_of(one)}, {one['verdict']}" for name, one in named)
+        told.append(f"{seen}: {'; '.join(cells)}")
     pairs = len(comparisons["z: input"]["by_seed"])
-    lead = f"Mean differences with 95% intervals, and a circle for each of {pairs} seeds: "
-    return describe(figure, "Study 1: points more or less than frame", lead, ["; ".join(told)])
+    lead = f"Means, 95% intervals, a circle for each of {pairs} seeds. "
+    return describe(figure, "Study 1: points more or less than frame", lead, [". ".join(told)])
 
 
 def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:
@@ -73,24 +73,48 @@ def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:
     axis.plot(one["by_seed"], places, "o", markersize=5, label="one seed", **seeds)
 
 
-def plot_learning_curves(curves: dict[str, dict]) -> Figure:
-    """Validation means of study 1 against all episodes driven, with bands over seeds.
+def plot_scores(arms: dict[str, dict]) -> Figure:
+    """The score of every pipeline of study 1, a circle each, and the mean of each arm.
 
     Args:
-        curves: "FEATURES: VARIANT" -> "episodes", "mean", "low" and "high".
+        arms: "FEATURES: VARIANT" -> "mean" and "by_seed".
+    """
+    figure, axes = new_figure(8.0, 2.9, 1, 2, sharex=True, sharey=True)
+    for axis, (features, title) in zip(axes[0], SEEN.items(), strict=True):
+        for height, (variant, colour) in enumerate(COLOURS.items()):
+            one = arms[f"{features}: {variant}"]
+            scores = one["by_seed"]
+            axis.plot(scores, [height] * len(scores), "o", markersize=5, markerfacecolor="white",
+                      markeredgecolor=colour)  # fmt: skip
+            axis.plot(one["mean"], height, "D", color=colour, markersize=7)
+        name_rows(axis, list(COLOURS))
+        caption(axis, title, "mean return on 400 tracks")
+    told = [f"{seen}: " + ", ".join(f"{one} {arms[f'{features}: {one}']['mean']:.0f}"
+            for one in COLOURS) for features, seen in SEEN.items()]  # fmt: skip
+    title = "Study 1: the score of every pipeline, and the mean of each arm"
+    return describe(figure, title, "Means: ", told)
+
+
+def plot_learning_curves(curves: dict[str, dict]) -> Figure:
+    """Validation means of study 1 less those of `frame`, against all episodes driven.
+
+    Args:
+        curves: "FEATURES: VARIANT" -> "episodes", "mean", "low" and "high" of the difference.
     """
     figure, axes = new_figure(8.6, 4.0, 1, 2, sharex=True, sharey=True)
+    variants = list(COLOURS)[1:]
     for axis, (features, title) in zip(axes[0], SEEN.items(), strict=True):
-        for (variant, colour), dash in zip(COLOURS.items(), DASHES, strict=True):
-            one = curves[f"{features}: {variant}"]
+        axis.axhline(0, color="black", linewidth=0.8)
+        for variant, dash in zip(variants, DASHES, strict=False):
+            one, colour = curves[f"{features}: {variant}"], COLOURS[variant]
             axis.fill_between(one["episodes"], one["low"], one["high"], color=colour, alpha=0.15)
             axis.plot(one["episodes"], one["mean"], dash, color=colour, label=variant)
         caption(axis, title, "episodes, those of the dataset included")
-    axes[0, 0].set_ylabel("validation mean")
+    axes[0, 0].set_ylabel("validation mean less that of frame")
     legend_below(figure, axes[0, 0])
-    ends = [f"{SEEN[arm.split(':')[0]]}, {arm.split(': ')[1]} {one['mean'][-1]:.0f}"
-            for arm, one in curves.items()]  # fmt: skip
-    title = "Study 1: learning curves, mean of the seeds with its 95% interval"
+    ends = [f"{seen}: " + ", ".join(f"{one} {curves[f'{features}: {one}']['mean'][-1]:+.0f}"
+            for one in variants) for features, seen in SEEN.items()]  # fmt: skip
+    title = "Study 1: learning curves less that of frame, with 95% intervals of the mean"
     return describe(figure, title, "At the end: ", ends)
 
 

@@ -8,7 +8,12 @@ import pytest
 from stad_lab.config import VARIANTS
 from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.replication.study_claims import FEATURES, MARGIN
-from stad_lab.viz.replication import plot_learning_curves, plot_representation, plot_study
+from stad_lab.viz.replication import (
+    plot_learning_curves,
+    plot_representation,
+    plot_scores,
+    plot_study,
+)
 
 
 @pytest.fixture
@@ -30,26 +35,37 @@ def test_the_forest_plot_has_a_circle_for_each_pipeline_and_a_line_at_the_gain_o
     comparisons,
 ):
     figure = plot_study(comparisons, MARGIN, 75.0)
-    for axis, features in zip(figure.axes, FEATURES, strict=True):
+    for axis, features in zip(figure.axes, ("z, h", "z"), strict=True):
         drawn = [list(line.get_xdata()) for line in axis.lines]
         for variant in VARIANTS[1:]:
             one = comparisons[f"{features}: {variant}"]
             assert one["by_seed"] in drawn and one["interval"] in drawn
-        assert [75, 75] in drawn
+        assert ([75, 75] in drawn) == (features == "z, h")  # what the paper's C sees
     label = figure.get_label()
     assert "a circle for each of 4 seeds" in label
-    assert "C sees z and h, input_output +50.0 (42.0 to 58.0), undecided" in label
+    assert "C sees z and h: input +30.0" in label
+    assert "input_output +50.0 (42.0 to 58.0), undecided" in label
 
 
 def test_learning_curves_have_a_band_over_the_seeds():
     curve = {"episodes": [900, 1200], "mean": [100.0, 800.0], "low": [50, 700], "high": [150, 900]}
-    arms = itertools.product(FEATURES, VARIANTS)
+    arms = itertools.product(FEATURES, VARIANTS[1:])
     figure = plot_learning_curves({f"{features}: {variant}": curve for features, variant in arms})
     for axis in figure.axes:
-        assert len(axis.lines) == len(axis.collections) == 4
+        assert len(axis.lines) == 1 + len(axis.collections) == 4  # one more at zero
         low = axis.collections[0].get_paths()[0].vertices
         assert [900, 50] in low.tolist() and [1200, 900] in low.tolist()
-    assert "C sees z, frame 800" in figure.get_label()
+    assert "C sees z: input +800" in figure.get_label()
+
+
+def test_every_pipeline_has_its_score():
+    one = {"mean": 820.0, "by_seed": [800.0, 820.0, 840.0]}
+    arms = {f"{features}: {variant}": one for features in FEATURES for variant in VARIANTS}
+    figure = plot_scores(arms)
+    for axis in figure.axes:
+        circles = [line for line in axis.lines if line.get_marker() == "o"]
+        assert [list(line.get_xdata()) for line in circles] == [one["by_seed"]] * 4
+    assert "C sees z and h: frame 820" in figure.get_label()
 
 
 def test_every_network_has_its_line():
