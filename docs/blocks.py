@@ -462,4 +462,6 @@ NUMBERS: dict[str, Callable[[dict], float]] = {
     ),
     "probed seeds": lambda claims: claims["study3"]["seeds"],
     "probed networks": lambda claims: claims["study3"]["networks"],
+    "runs of study 5": lambda claims: sum(claims["study5"]["runs"].values()),
+    "planned runs of study 5": lambda claims: sum(claims["study5"]["planned"].values()),
 }

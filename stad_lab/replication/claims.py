@@ -13,7 +13,7 @@ import pandas
 from stad_lab.agent import PRETRAINED
 from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
-from stad_lab.replication import measurements, study_claims, tables
+from stad_lab.replication import measurements, study5_claims, study_claims, tables
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
 from stad_lab.training.record import total_budget
 
@@ -31,6 +31,7 @@ def compute_claims() -> dict[str, dict]:
     return {
         "study1": study_claims.describe_study1(),
         "study3": study_claims.describe_study3(),
+        "study5": study5_claims.describe_study5(),
         "agents": describe_agents(),
         "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
         "probe": measurements.describe_probe(tables.read("probe")),
