@@ -200,7 +200,8 @@ def with_values(base: Any, values: dict) -> Any:
         if name not in known:
             raise ValueError(f"unknown setting {name!r}: expected one of {', '.join(known)}")
         stage = getattr(base, name)
-        changed[name] = with_values(stage, value) if isinstance(value, dict) else value
+        nested = isinstance(value, dict) and dataclasses.is_dataclass(stage)
+        changed[name] = with_values(stage, value) if nested else value
     return dataclasses.replace(base, **changed)
 
 

@@ -17,7 +17,7 @@ from PIL import Image, ImageSequence
 from stad_lab import cli
 from stad_lab.cli import COMMANDS, main, parse
 from stad_lab.config import PRESETS, VARIANTS, Config, fields_of
-from stad_lab.io.files import load_json, save_json
+from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors
 from stad_lab.io.weights import (
     load_vae,
     load_world_model,
@@ -416,6 +416,14 @@ def test_training_on_top_of_weights_of_another_size_ends_in_one_clear_line(part,
     error = the_error(capsys, *train_quickly(run))
     assert f"{part}.safetensors was made with {part}." in error
     assert "_size=16" in error
+
+
+def test_weights_of_an_impossible_architecture_end_in_one_clear_line(run, capsys):
+    tensors, metadata = load_tensors(run / "vae.safetensors")
+    metadata["vae"]["width"] = "wide"
+    save_tensors(run / "vae.safetensors", tensors, **metadata)
+    error = the_error(capsys, *evaluate_quickly(run))
+    assert "vae.safetensors is not a file of this kind: vae.width='wide' is a str" in error
 
 
 def test_weights_that_do_not_fit_their_own_metadata_end_in_one_clear_line(run, capsys):
