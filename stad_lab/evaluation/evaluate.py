@@ -25,6 +25,7 @@ from stad_lab.io.files import (
 from stad_lab.io.workers import run_tasks, worker_processes, worker_threads
 from stad_lab.training.evolution import drive_group, hand_out
 from stad_lab.training.pipeline import RUN_FILES
+from stad_lab.training.record import provenance
 
 MOST_EPISODES = 10_000  # a bootstrap of more would need more than 2 GB
 KIND = "evaluation"
@@ -51,7 +52,8 @@ def evaluate(
 
     Returns:
         A dict for JSON: "variant", "renderer" ("gymnasium" or "fast"), "controller" (checksum of
-        C), what `summarise` computes, "seconds", and "episodes": "track", "return" and "frames".
+        C), what `summarise` computes, "seconds", "made_with" (versions and machine), and
+        "episodes": "track", "return" and "frames".
 
     Raises:
         ValueError: tracks outside the range for tests; and what `load_agent` raises.
@@ -83,7 +85,9 @@ def evaluate(
                     save_json(unfinished, now)
     returns, lengths = zip(*(driven[str(track)] for track in tracks), strict=True)
     result = report(tracks, np.array(returns), np.array(lengths))
-    return {"kind": KIND, **identity, **result, "seconds": time.perf_counter() - begin}
+    seconds, command = time.perf_counter() - begin, f"python -m stad_lab evaluate --agent {source}"
+    made_with = provenance(f"{command} --episodes {episodes} --first-track {first_track}")
+    return {"kind": KIND, **identity, **result, "seconds": seconds, "made_with": made_with}
 
 
 def check_tracks(episodes: int, first_track: int) -> None:

@@ -14,6 +14,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
@@ -21,6 +22,7 @@ from stad_lab.agent import load_agent
 from stad_lab.cli import main
 from stad_lab.config import Config
 from stad_lab.evaluation.evaluate import evaluate
+from stad_lab.evaluation.statistics import summarise
 from stad_lab.evaluation.verify import verify, verify_dataset
 from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors, write_bytes
 from stad_lab.io.workers import TaskError
@@ -567,7 +569,49 @@ def test_verify_finds_a_return_that_no_episode_gives(quick_run, tmp_path, in_thi
     elsewhere = record["made_with"] | {"processor": "another processor"}
     save_json(folder / "record.json", record | {"continued_with": [elsewhere]})
     episodes = verify(folder, in_this_process)["episodes"]
-    assert re.match(r"differs: .*; but processor is '.*' and was 'another processor'", episodes)
+    assert re.match(r"differs: .*; processor is '.*' and was 'another processor'", episodes)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "points", "expected"),
+    [
+        ({}, 0.001, "FAILED"),
+        ({"numba": None}, 0.001, "differs: .*; unknown, because not recorded: numba$"),
+        ({"numba": None}, 60, "FAILED"),
+        ({"processor": "another"}, 29, "differs: .*; processor is '.*' and was 'another'$"),
+        ({"processor": "another"}, 60, "FAILED.*: rounding alone does not explain it"),
+    ],
+)
+def test_verify_tolerates_a_bounded_difference_and_only_from_another_or_an_unknown_machine(
+    recorded, points, expected, whole, tmp_path, in_this_process
+):
+    folder = shutil.copytree(whole, tmp_path / "run", ignore=WITHOUT_DATASET)
+    result = load_json(folder / "evaluation.json")
+    made_with = result["made_with"] | recorded
+    known = {name: value for name, value in made_with.items() if value is not None}
+    for episode in result["episodes"]:
+        episode["return"] += points
+    summary = summarise(np.array([episode["return"] for episode in result["episodes"]]))
+    save_json(folder / "evaluation.json", result | summary | {"made_with": known})
+    assert re.match(expected, verify(folder, in_this_process)["episodes"])
+
+
+def test_verify_tolerates_rounding_in_a_replayed_log_and_nothing_more(
+    quick_run, tmp_path, in_this_process
+):
+    folder = shutil.copytree(quick_run, tmp_path / "run", ignore=WITHOUT_DATASET)
+    record, log = (load_json(folder / name) for name in ("record.json", "evolution.json"))
+    elsewhere = record["made_with"] | {"processor": "another"}
+    save_json(folder / "record.json", record | {"made_with": elsewhere})
+    first = log["generations"][0]
+    first["mean_checksum"] += 1  # as if its last bits had been others
+    save_json(folder / "evolution.json", log)
+    found = verify(folder, in_this_process)["log of CMA-ES"]
+    assert found.startswith("differs: replaying the log gives another mean in generation 1")
+    first["returns"] = first["returns"][::-1]
+    save_json(folder / "evolution.json", log)
+    found = verify(folder, in_this_process)["log of CMA-ES"]
+    assert found.startswith("FAILED: replaying the log gives another mean in generation 1")
 
 
 def test_verify_drives_the_episodes_of_an_evaluation_again(whole, tmp_path, in_this_process):
