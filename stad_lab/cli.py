@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from stad_lab.config import PRESETS, Config
+from stad_lab.config import PRESETS, REPORTED_TRACKS, STUDY_TRACKS, Config
 
 CONTINUES = (
     "train",
@@ -220,8 +220,8 @@ def fine_tune(
 
 def evaluate(
     agent: str,
-    episodes: int = 100,
-    first_track: int = 0,
+    episodes: int = len(REPORTED_TRACKS),
+    first_track: int = REPORTED_TRACKS.start,
     fast: bool = False,
     processes: int = 2,
     json: Path | None = None,
@@ -245,8 +245,8 @@ def evaluate(
     from stad_lab.io.files import save_json
 
     load_agent(agent)
-    other = "-fast" * fast + f"-from-{first_track}" * (first_track != 0)
-    other += f"-{episodes}-tracks" * (episodes != 100)
+    other = "-fast" * fast + f"-from-{first_track}" * (first_track != REPORTED_TRACKS.start)
+    other += f"-{episodes}-tracks" * (episodes != len(REPORTED_TRACKS))
     file = result_file(json, agent, "evaluation", other)
     unfinished = file.with_name(f"unfinished-{file.name}")
     with cluster_of(scheduler) as executor:
@@ -318,8 +318,8 @@ def replicate(
 
 def evaluate_study(
     study: tyro.conf.Positional[str],
-    first_track: int = 1000,
-    episodes: int = 400,
+    first_track: int = STUDY_TRACKS.start,
+    episodes: int = len(STUDY_TRACKS),
     seeds: list[int] | None = None,
     only: list[str] | None = None,
     json: Path | None = None,

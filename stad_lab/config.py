@@ -303,6 +303,9 @@ TRACK_RANGES = {
     "inspect": (4_000_000, 5_000_000),
 }
 
+# Of the tracks for tests: those of a reported evaluation, and of the studies' scores.
+REPORTED_TRACKS, STUDY_TRACKS = range(100), range(1000, 1400)
+
 
 def track_seeds(use: str, count: int, seed: int = 0, *numbers: int) -> list[int]:
     """Seeds of `count` tracks from the range of one use, drawn with a seed and further numbers."""

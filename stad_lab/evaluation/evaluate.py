@@ -1,7 +1,7 @@
 """Evaluation: an agent on tracks that neither training nor validation ever touches.
 
 What we report is driven in Gymnasium's own CarRacing-v3 with its own renderer, whole episodes, on
-the tracks 0 to 99. Each track is named by its seed, so that anyone can drive it again.
+`config.REPORTED_TRACKS`. Each track is named by its seed, so that anyone can drive it again.
 """
 
 import time
@@ -13,7 +13,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent, load_agent, run_folder
-from stad_lab.config import TRACK_RANGES
+from stad_lab.config import REPORTED_TRACKS, TRACK_RANGES
 from stad_lab.evaluation.statistics import SOLVED, summarise
 from stad_lab.io.files import (
     check_writable,
@@ -33,8 +33,8 @@ KIND = "evaluation"
 
 def evaluate(
     source: str | Path,
-    episodes: int = 100,
-    first_track: int = 0,
+    episodes: int = len(REPORTED_TRACKS),
+    first_track: int = REPORTED_TRACKS.start,
     fast: bool = False,
     processes: int = 2,
     executor: Executor | None = None,

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 
-from stad_lab.config import flatten
+from stad_lab.config import REPORTED_TRACKS, flatten
 from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.io.files import checksum_of_tensors, load_json, load_tensors, write_bytes
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
@@ -22,7 +22,6 @@ from stad_lab.training.evolution import fitness_curves
 from stad_lab.training.record import total_budget
 
 DATA = Path(__file__).parent / "data"
-TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
 UNITS = ("agents", "episodes", "frames")
 RUN = ["experiment", "role", "seed"]
 PIPELINE = ["study", "variant", "features", "seed"]
@@ -76,8 +75,8 @@ def episodes(folder: Path = DATA) -> pandas.DataFrame:
 
 def check_tracks(name: str, tracks) -> None:
     """Raise ValueError unless an evaluation drives every test track once."""
-    if sorted(tracks) != list(range(TRACKS)):
-        raise ValueError(f"{name}: expected one episode on each of the tracks 0 to {TRACKS - 1}")
+    if sorted(tracks) != list(REPORTED_TRACKS):
+        raise ValueError(f"{name}: expected one episode on each of {REPORTED_TRACKS}")
 
 
 def returns_of(table: pandas.DataFrame, column: str = "return") -> dict[str, np.ndarray]:
