@@ -22,6 +22,7 @@ from stad_lab.training.evolution import fitness_curves
 from stad_lab.training.record import total_budget
 
 DATA = Path(__file__).parent / "data"
+TRACKS = len(REPORTED_TRACKS)  # of each run, with Gymnasium's renderer
 UNITS = ("agents", "episodes", "frames")
 RUN = ["experiment", "role", "seed"]
 PIPELINE = ["study", "variant", "features", "seed"]
