@@ -7,6 +7,7 @@ What a command needs is imported when it is called, so that `check` runs where P
 import contextlib
 import functools
 import io
+import itertools
 import re
 import sys
 from collections.abc import Callable
@@ -58,10 +59,12 @@ def parse(arguments: list[str]) -> Callable[[], int | None]:
     tyro calls a command as soon as it has parsed it; this defers it, so that only what the parser
     writes is caught. Wrong usage raises ValueError with one line.
     """
-    preset = None
-    if arguments[:1] == ["train"] and len(arguments) > 1 and not arguments[1].startswith("-"):
-        preset, arguments = arguments[1], ["train", *arguments[2:]]
-    commands = COMMANDS | {"train": training_command(Config.preset(preset))}
+    command, commands = arguments[0] if arguments else "", COMMANDS
+    if command and not command.startswith("-") and command not in COMMANDS:
+        raise ValueError(f"unknown command {command!r}: choose one of {', '.join(COMMANDS)}")
+    if command == "train":
+        preset, arguments = take_preset(arguments)
+        commands = COMMANDS | {"train": training_command(Config.preset(preset))}
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):
@@ -76,6 +79,18 @@ def parse(arguments: list[str]) -> Callable[[], int | None]:
         if not ended.code:
             raise
         raise ValueError(f"{one_line(told.getvalue())}; see {PROGRAM} --help") from None
+
+
+def take_preset(arguments: list[str]) -> tuple[str | None, list[str]]:
+    """The preset that the arguments of `train` name, and the others: "train --out RUN quick", too.
+
+    Whatever follows `train` is one, so that a misspelt preset is refused as such.
+    """
+    for place, (before, one) in enumerate(itertools.pairwise(arguments), 1):
+        first = place == 1 and not one.startswith("-")
+        if first or (one in PRESETS and not before.startswith("-")):
+            return one, [*arguments[:place], *arguments[place + 1 :]]
+    return None, arguments
 
 
 def deferred(command: Callable) -> Callable:

@@ -124,7 +124,7 @@ class EvolutionConfig:
     components: int = 48
     """Optimise along so many principal components of what C sees, at most; 0 for every weight."""
     features: Literal["z, h", "z", "h"] = "z, h"
-    """What C sees."""
+    """What C sees: "z, h" with its quotes, z or h."""
     initial_gas: float = -0.5
     """Gas output of the first controller before squashing; (tanh(-0.5) + 1) / 2 is 27% gas."""
     patience: int = 100

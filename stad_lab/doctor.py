@@ -21,7 +21,7 @@ COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
 LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = ("numpy", "scipy", "pandas", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma")
-MODULES += ("safetensors", "psutil", "tyro")
+MODULES += ("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl")
 OPTIONAL_MODULES = ("matplotlib", "PIL", "sklearn", "ipywidgets", "distributed")  # of the extras
 
 

@@ -297,6 +297,7 @@ def test_a_wrong_name_or_value_ends_in_one_clear_line(options, parts, tmp_path, 
     ("command", "message"),
     [
         ("train fast --out run", "unknown preset 'fast': choose one of quick, laptop, paper"),
+        ("compet --help", "unknown command 'compet': choose one of check, train"),
         ("train quick", "--out"),
         ("", "Missing subcommand"),
         ("driving", "driving"),
@@ -367,6 +368,18 @@ def test_a_run_of_another_configuration_ends_in_one_clear_line(option, value, wa
     parts = str(run), was, str(value), "choose another folder, or the same settings"
     assert [part for part in parts if part not in error] == []
     assert states(run) == before
+
+
+def test_a_preset_may_stand_anywhere_and_a_wrong_one_in_the_environment_breaks_train_alone(
+    monkeypatch,
+):
+    for command in ("train quick --out run", "train --out run quick", "train --out quick quick"):
+        arguments = parse(command.split()).keywords
+        assert arguments["config"] == QUICK and arguments["out"] in ("run", "quick")
+    monkeypatch.setenv("STAD_LAB_PRESET", "bogus")
+    assert parse(["evaluate", "--agent", "frame"]).keywords["agent"] == "frame"
+    with pytest.raises(ValueError, match="unknown preset 'bogus'"):
+        parse(["train", "--out", "run"])
 
 
 @pytest.mark.parametrize("made", [True, False])

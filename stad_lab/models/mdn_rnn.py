@@ -56,7 +56,7 @@ class Mixture(NamedTuple):
         flat = weights.reshape(-1, weights.shape[-1])
         choice = torch.multinomial(flat, 1, generator=generator).view(*weights.shape[:-1], 1)
         mean, logsigma = (part.gather(-1, choice)[..., 0] for part in (self.mean, self.logsigma))
-        noise = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)
+        noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
         return mean + logsigma.exp() * math.sqrt(temperature) * noise
 
 
