@@ -13,7 +13,7 @@ from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
 
 from stad_lab.envs import physics, picture
-from stad_lab.envs.cars import Cars, pose_on, road_polygons
+from stad_lab.envs.cars import Cars, check_rules, pose_on, road_polygons
 from stad_lab.envs.frames import OBSERVATION_SHAPE
 from stad_lab.envs.track import tile_colors
 
@@ -35,7 +35,7 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
         [-1, 1], gas and brake in [0, 1]. An episode is cut at 1,000 frames.
 
     Raises:
-        ValueError: an option that the environment does not have.
+        ValueError: an option that the environment does not have, or another value of it.
     """
     options = inspect.signature(CarRacing if fast else reference.CarRacing).parameters
     options = [*options, "max_episode_steps", "disable_env_checker"]
@@ -44,6 +44,8 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
             f"make_env: unknown {', '.join(unknown)}; choose from {', '.join(options)}. The seed of"
             " a track belongs to reset: env.reset(seed=1)"
         )
+    rules = ("continuous", "lap_complete_percent", "domain_randomize", "bar")
+    check_rules(**{name: kwargs[name] for name in rules if name in kwargs})
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
 
 

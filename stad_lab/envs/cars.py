@@ -38,7 +38,7 @@ class Cars:
         domain_randomize: whether each episode has its own random colours.
 
     Raises:
-        ValueError: another share of a lap.
+        ValueError: as `check_rules`.
 
     Attributes:
         cars: `physics.CAR` (count,), the state of each car; see there.
@@ -59,8 +59,7 @@ class Cars:
         lap_complete_percent: float = 0.95,
         domain_randomize: bool = False,
     ):
-        if not 0 <= lap_complete_percent <= 1:
-            raise ValueError(f"lap_complete_percent={lap_complete_percent}: expected 0 to 1")
+        check_rules(continuous, lap_complete_percent, domain_randomize, bar)
         warm_up()
         self.shows, self.bar, self.continuous = shows, bar, continuous
         self.lap_complete_percent = float(lap_complete_percent)
@@ -197,6 +196,22 @@ class Cars:
         self.colors["background"][car] = random.uniform(0, 210, size=3)
         self.colors["grass"][car] = self.colors["background"][car]
         self.colors["grass"][car, random.integers(3)] += 20
+
+
+def check_rules(
+    continuous: bool = True,
+    lap_complete_percent: float = 0.95,
+    domain_randomize: bool = False,
+    bar: bool = True,
+) -> None:
+    """Raise ValueError for another share of a lap than 0 to 1, or a switch that is no bool."""
+    switches = {"continuous": continuous, "domain_randomize": domain_randomize, "bar": bar}
+    for name, value in switches.items():
+        if not isinstance(value, bool | np.bool_):
+            raise ValueError(f"{name}={value!r}: expected True or False")
+    number = isinstance(lap_complete_percent, int | float | np.number)
+    if not number or not 0 <= lap_complete_percent <= 1:
+        raise ValueError(f"lap_complete_percent={lap_complete_percent!r}: expected 0 to 1")
 
 
 def pose_on(
