@@ -192,8 +192,9 @@ def rollout(
         patience: an episode ends after so many frames without a new tile; 0 for never.
         observe: called before every step with the numbers of the cars, what they see, and actions.
     """
-    if max_frames < 1:
-        raise ValueError(f"max_frames={max_frames}: expected at least 1")
+    for name, value, least in (("max_frames", max_frames, 1), ("patience", patience, 0)):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise ValueError(f"{name}={value!r}: expected a whole number from {least} on")
     returns, rewards = np.zeros(len(batch)), [[] for _ in range(len(batch))]
     last_tile = np.zeros(len(batch), int)  # the frame in which a car last reached a new tile
     driving = np.arange(len(batch))
@@ -227,11 +228,12 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
         fast: use our engine, which draws the agent's frames directly, not Gymnasium's environment.
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
     """
-    tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
-    if not tracks:
+    if not len(tracks):
         raise ValueError("tracks is empty: expected the seed of at least one track")
-    if min(tracks) < 0:
-        raise ValueError(f"track {min(tracks)}: expected at least 0, the seed of a track")
+    for track in tracks:
+        if not isinstance(track, int | np.integer) or track < 0:
+            raise ValueError(f"track {track!r}: expected at least 0, a whole number")
+    tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
     if fast:
         cars = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)
         cars.reset(tracks)

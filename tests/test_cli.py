@@ -25,6 +25,7 @@ from stad_lab.io.weights import (
     save_mdn_rnn,
     save_vae,
 )
+from stad_lab.io.workers import TaskError
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training.pipeline import STAGES
@@ -380,6 +381,15 @@ def test_a_preset_may_stand_anywhere_and_a_wrong_one_in_the_environment_breaks_t
     assert parse(["evaluate", "--agent", "frame"]).keywords["agent"] == "frame"
     with pytest.raises(ValueError, match="unknown preset 'bogus'"):
         parse(["train", "--out", "run"])
+
+
+@pytest.mark.parametrize(
+    "message",
+    ["could not create a primitive", "[enforce fail] DefaultCPUAllocator: can't allocate memory"],
+)
+def test_memory_that_is_too_short_is_named_as_such(message):
+    for error in (RuntimeError(message), TaskError(f"drive_group failed in a worker: {message}")):
+        assert cli.explain(error) == f"too large for this machine: {error}"
 
 
 @pytest.mark.parametrize("made", [True, False])

@@ -49,11 +49,24 @@ def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
     try:
         for file in folder.glob(".*.part"):
             ours = re.search(r"\.(\d+)\.[^.]*\.part$", file.name)
-            if ours and not psutil.pid_exists(int(ours[1])):
+            if ours and is_left_over(file, int(ours[1])):
                 file.unlink(missing_ok=True)
         yield
     finally:
         lock.release()
+
+
+def is_left_over(file: Path, process: int) -> bool:
+    """Whether a file was begun by a process that has ended, though another may have its number.
+
+    In a container every run is process 1.
+    """
+    try:
+        return psutil.Process(process).create_time() > file.stat().st_mtime
+    except (psutil.NoSuchProcess, FileNotFoundError):
+        return True
+    except psutil.Error:  # of another user
+        return False
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -174,7 +187,7 @@ def load_json(path: Path, remedy: str = "make it again", kind: str | None = None
     """
     content = read_bytes(path, remedy)
     try:
-        value = json.loads(content)
+        value = json.loads(content, object_pairs_hook=without_duplicates)
         wanted = value.pop(CHECKSUM)
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
@@ -182,6 +195,15 @@ def load_json(path: Path, remedy: str = "make it again", kind: str | None = None
         raise damaged(path, "its content is not that of its checksum", remedy)
     if kind and value.get("kind", kind) != kind:
         raise ValueError(f"{path} is of kind {value['kind']!r}: expected {kind!r}")
+    return value
+
+
+def without_duplicates(pairs: list[tuple[str, Any]]) -> dict:
+    """The dict of some pairs; ValueError if a key is there twice, since one would be ignored."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"{next(key for key in keys if keys.count(key) > 1)!r} is there twice")
     return value
 
 

@@ -374,11 +374,41 @@ def test_half_written_files_of_a_killed_process_are_removed_and_those_of_others_
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     left_over = folder / f".evolution.json.{ended.pid}.abc.part"
+    another_run = folder / ".evolution.json.1.abc.part"  # of a container, whose first process is 1
     others = [folder / ".thesis.zip.part", folder / f".log.{os.getppid()}.abc.part"]
-    for file in (left_over, *others):
+    for file in (left_over, another_run, *others):
         file.write_bytes(b"{")
+    os.utime(another_run, (0, 0))
     evolve(QUICK, folder, in_this_process)
-    assert not left_over.exists() and all(file.exists() for file in others)
+    assert not left_over.exists() and not another_run.exists()
+    assert all(file.exists() for file in others)
+
+
+def test_a_key_that_is_there_twice_is_a_damage(tmp_path):
+    file = tmp_path / "file.json"
+    save_json(file, {"mean": 900})
+    file.write_text(file.read_text().replace('"mean"', '"mean": 900, "mean"', 1))
+    with pytest.raises(ValueError, match="'mean' is there twice"):
+        load_json(file)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell with sh's redirections")
+@pytest.mark.parametrize("redirection", [">&- 2>&-", "2>&1 | head -1"])
+def test_a_training_outlives_the_readers_of_its_output(redirection, quick_run, tmp_path):
+    folder = start_of("controller", quick_run, tmp_path / "run")
+    arguments = f"train quick --variant input_output --out {folder}"
+    command = f"{sys.executable} -m stad_lab {arguments} {redirection}"
+    subprocess.run(command, shell=True, timeout=120, capture_output="head" in redirection)
+    assert_equal_results(folder, quick_run, "controller")
+
+
+def test_a_file_is_never_written_through_a_link(tmp_path):
+    """A temporary name cannot be guessed, and a link in its place is not followed."""
+    (tmp_path / "secret").write_text("kept")
+    (tmp_path / "file.json").symlink_to(tmp_path / "secret")
+    save_json(tmp_path / "file.json", {})
+    assert (tmp_path / "secret").read_text() == "kept"
+    assert not (tmp_path / "file.json").is_symlink()
 
 
 def test_an_environment_that_raises_stops_the_run_with_its_cause_and_the_run_continues_later(
