@@ -28,7 +28,7 @@ from stad_lab.training.pipeline import RUN_FILES
 from stad_lab.training.record import provenance
 
 MOST_EPISODES = 10_000  # a bootstrap of more would need more than 2 GB
-KIND = "evaluation"
+KIND, UNFINISHED = "evaluation", "unfinished evaluation"
 
 
 def evaluate(
@@ -66,7 +66,8 @@ def evaluate(
     # Of V and M as they are loaded: a shipped agent's may be of lower precision.
     weights = {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
     asked = {**identity, "tracks": tracks, **weights}
-    known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
+    there = unfinished and unfinished.exists()
+    known = load_json(unfinished, "evaluate again", kind=UNFINISHED) if there else {}
     driven = known["driven"] if known.get("asked") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]
@@ -80,7 +81,12 @@ def evaluate(
         for number, (returns, lengths) in tqdm(results, f"evaluate ({agent.vae.variant})", **shown):
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
-                now = {"asked": asked, "driven": driven, "seconds": time.perf_counter() - begin}
+                now = {
+                    "kind": UNFINISHED,
+                    "asked": asked,
+                    "driven": driven,
+                    "seconds": time.perf_counter() - begin,
+                }
                 with suppress(OSError):  # with a full disk it goes on, but cannot be resumed
                     save_json(unfinished, now)
     returns, lengths = zip(*(driven[str(track)] for track in tracks), strict=True)

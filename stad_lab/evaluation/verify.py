@@ -114,7 +114,7 @@ def verify_dataset(folder: Path) -> str:
     """Check every file of the dataset against the manifest."""
     if not (folder / MANIFEST).exists():
         return MISSING
-    made, wanted = count_episodes(load_json(folder / MANIFEST))
+    made, wanted = count_episodes(load_json(folder / MANIFEST, kind="dataset"))
     if made < wanted:
         return f"none: {made} of {wanted} episodes so far"
     dataset = Dataset(folder)
@@ -123,7 +123,7 @@ def verify_dataset(folder: Path) -> str:
 
 def logged(folder: Path, config: Config) -> tuple[Config, dict]:
     """The log of CMA-ES, and the configuration with its generations: a run may be longer now."""
-    asked = load_json(folder / evolution.LOG)["evolution"]["generations"]
+    asked = load_json(folder / evolution.LOG, kind="evolution")["evolution"]["generations"]
     config = config.replace(evolution={"generations": asked})
     return config, evolution.read_log(config, folder, load_world_model(folder))
 

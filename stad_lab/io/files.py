@@ -24,6 +24,8 @@ import torch
 from filelock import FileLock, Timeout
 from safetensors.torch import load, save
 
+from stad_lab.io.kinds import SHAPES, find_fault
+
 METADATA = "stad_lab"  # the entry of a safetensors header that holds our metadata
 CHECKSUM = "checksum"
 PATIENCE = 1.0 if os.name == "nt" else 0.0  # seconds that a virus scanner may hold a file
@@ -183,7 +185,8 @@ def load_json(path: Path, remedy: str = "make it again", kind: str | None = None
 
     Raises:
         OSError: as `read_bytes`.
-        ValueError: the file is damaged, was changed by hand, or names another kind as its own.
+        ValueError: the file is damaged, was changed by hand, names another kind as its own, or
+            lacks what a file of its kind holds.
     """
     content = read_bytes(path, remedy)
     try:
@@ -195,7 +198,15 @@ def load_json(path: Path, remedy: str = "make it again", kind: str | None = None
         raise damaged(path, "its content is not that of its checksum", remedy)
     if kind and value.get("kind", kind) != kind:
         raise ValueError(f"{path} is of kind {value['kind']!r}: expected {kind!r}")
+    check_kind(path, value, value.get("kind", kind), remedy)
     return value
+
+
+def check_kind(path: Path, value: dict, kind: Any, remedy: str) -> None:
+    """Raise ValueError unless the content of a file has the shape of its kind, if that is known."""
+    shape = SHAPES.get(kind) if isinstance(kind, str) else None
+    if shape and (fault := find_fault(value, shape)):
+        raise ValueError(f"{path} is not a file of the kind {kind!r}: {fault}; {remedy}")
 
 
 def without_duplicates(pairs: list[tuple[str, Any]]) -> dict:
@@ -256,6 +267,7 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     wanted = metadata.pop(CHECKSUM, None)
     if checksum_of_tensors(tensors, json.dumps(metadata)) != wanted:
         raise damaged(path, "its content is not that of its checksum", remedy)
+    check_kind(path, metadata, metadata.get("kind"), remedy)
     return tensors, metadata
 
 

@@ -1,7 +1,9 @@
 """Damaged files, killed processes, full disks: nothing is lost, and nothing damaged is used."""
 
 import contextlib
+import copy
 import errno
+import functools
 import os
 import random
 import re
@@ -809,3 +811,66 @@ def test_a_full_training_reads_and_hashes_each_file_of_the_dataset_once(
     assert train(config, run, executor=in_this_process)
     files = {path.name for path in (run / "dataset").glob("*.npy")}
     assert set(counted) == files and set(counted.values()) == {1}
+
+
+# Files with a right checksum and a wrong content
+
+
+def places(value, place=()):
+    """Every place in a nested value, of a list the first element."""
+    if place:
+        yield place
+    pairs = value.items() if isinstance(value, dict) else enumerate(value[:1])
+    for key, part in pairs if isinstance(value, dict | list) else ():
+        yield from places(part, (*place, key)) if isinstance(part, dict | list) else [(*place, key)]
+
+
+def changed(value, place, new):
+    """A copy of a nested value with another part, or without it if `new` is None."""
+    whole = copy.deepcopy(value)
+    part = functools.reduce(lambda one, key: one[key], place[:-1], whole)
+    if new is None:
+        del part[place[-1]]
+    else:
+        part[place[-1]] = new
+    return whole
+
+
+@pytest.mark.parametrize("name", ["record.json", "evolution.json", "dataset/manifest.json"])
+def test_a_file_with_a_right_checksum_and_a_wrong_content_is_refused_in_one_line(
+    name, quick_run, tmp_path, in_this_process
+):
+    run = shutil.copytree(quick_run, tmp_path / "run")
+    value, rng, refused = load_json(run / name), random.Random(name), 0
+    for place in rng.sample(list(places(value)), 8):
+        save_json(run / name, changed(value, place, rng.choice([None, "x", [], {}, -1])))
+        found = "; ".join(failures_of(lambda: verify(run, in_this_process)))
+        assert not re.search("object|subscript|FAILED: '|expected str", found), (place, found)
+        refused += bool(found)
+    assert refused >= 2
+
+
+def failures_of(check):
+    """What a check of a run refuses: the ValueError's message, or what it says FAILED."""
+    try:
+        return [text for text in check().values() if text.startswith("FAILED")]
+    except ValueError as error:
+        return [str(error)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "new", "fault"),
+    [
+        ("evaluation", ("episodes", 0, "return"), "x", "episodes[0].return is not of type float"),
+        ("evaluation", ("episodes", 0, "track"), None, "it lacks episodes[0].track"),
+        ("evolution", ("best",), 3, "best is not of type dict"),
+        ("record", ("made_with",), [], "made_with is not of type dict"),
+    ],
+)
+def test_what_a_file_lacks_is_named(kind, place, new, fault, whole, tmp_path):
+    names = {"evaluation": "evaluation.json", "evolution": "evolution.json"}
+    value = load_json(whole / names.get(kind, "record.json"))
+    save_json(tmp_path / "file.json", changed(value, place, new))
+    with pytest.raises(ValueError, match="is not a file of the kind") as caught:
+        load_json(tmp_path / "file.json", "make it again")
+    assert str(caught.value).endswith(f"{kind!r}: {fault}; make it again")
