@@ -20,4 +20,7 @@ if __name__ == "__main__":
     except KeyboardInterrupt:  # which `main` itself handles
         print("\nstopped", file=sys.stderr)
         sys.exit(130)
+    except ModuleNotFoundError as error:
+        print(f"error: {error}: pip install 'stad_lab[train]'", file=sys.stderr)
+        sys.exit(2)
     sys.exit(main())

@@ -119,8 +119,8 @@ def explain(error: Exception) -> str | None:
     torch_is_short = isinstance(error, RuntimeError) and short  # PyTorch has no error of its own
     if isinstance(error, MemoryError | OverflowError) or torch_is_short:
         return f"too large for this machine: {error or type(error).__name__}"
-    if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
-        return f"{error}: pip install 'stad_lab[{EXTRAS[error.name]}]'"
+    if isinstance(error, ModuleNotFoundError) and "pip install" not in str(error):
+        return f"{error}: pip install 'stad_lab[{EXTRAS.get(error.name, 'train')}]'"
     known = ValueError, OSError, FloatingPointError, ImportError
     if isinstance(error, known) or type(error).__name__ == "TaskError":
         return str(error)
