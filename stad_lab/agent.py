@@ -194,7 +194,7 @@ def rollout(
     """
     for name, value, least in (("max_frames", max_frames, 1), ("patience", patience, 0)):
         if not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"{name}={value!r}: expected a whole number from {least} on")
+            raise ValueError(f"{name}={value!r}: expected at least {least}, a whole number")
     returns, rewards = np.zeros(len(batch)), [[] for _ in range(len(batch))]
     last_tile = np.zeros(len(batch), int)  # the frame in which a car last reached a new tile
     driving = np.arange(len(batch))
