@@ -6,7 +6,7 @@ CarRacing, with difference images in the autoencoder. Begin with the notebooks; 
 first needs neither PyTorch nor anything else of the extra `train`:
 
     gymnasium.make("stad_lab:StadLab/CarRacing-v3")
-    gymnasium.make("stad_lab:StadLab/Dream-v0", source="frame")
+    gymnasium.make("stad_lab:StadLab/Dream-v0", agent="frame", temperature=1.0)
 """
 
 import importlib

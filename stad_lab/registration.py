@@ -22,7 +22,11 @@ def register_environments() -> None:
             reward_threshold=900,
             max_episode_steps=1000,
         )
-        register("StadLab/Dream-v0", "stad_lab.dreaming:make_dream")
+        register(
+            "StadLab/Dream-v0",
+            "stad_lab.dreaming:make_dream",
+            vector_entry_point="stad_lab.dreaming:make_dreams",
+        )
 
 
 class RegisterLater:
