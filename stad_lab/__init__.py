@@ -2,14 +2,16 @@
 
 An independent, teachable replication of STAD (Kotyan, Vargas, Venkanna 2019): World Models on
 CarRacing, with difference images in the autoencoder. Begin with the notebooks; the command line is
-`python -m stad_lab --help`. Importing the package registers two environments with Gymnasium:
+`python -m stad_lab --help`. Importing the package registers two environments with Gymnasium. The
+first needs neither PyTorch nor anything else of the extra `train`:
 
     gymnasium.make("stad_lab:StadLab/CarRacing-v3")
-    gymnasium.make("stad_lab:StadLab/Dream-v0", source="frame")
+    gymnasium.make("stad_lab:StadLab/Dream-v0", agent="frame", temperature=1.0)
 """
 
-import contextlib
 import importlib
+
+from stad_lab.registration import register_when_used
 
 HOMES = {
     "Agent": "agent",
@@ -25,7 +27,13 @@ def __getattr__(name: str):
     """Import a public name when it is first used: `check_environment` runs without PyTorch."""
     if name not in HOMES:
         raise AttributeError(f"module 'stad_lab' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"stad_lab.{HOMES[name]}"), name)
+    try:
+        return getattr(importlib.import_module(f"stad_lab.{HOMES[name]}"), name)
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith("stad_lab"):
+            raise
+        remedy = "pip install 'stad_lab[train]'"
+        raise ModuleNotFoundError(f"{error}: {remedy}", name=error.name) from error
 
 
 def __dir__() -> list[str]:
@@ -33,16 +41,4 @@ def __dir__() -> list[str]:
     return __all__
 
 
-# By the names of their modules, which Gymnasium imports when an environment is made. Without a
-# working Gymnasium the doctor must still run: it reports what is wrong.
-with contextlib.suppress(Exception):
-    from gymnasium import register
-
-    register(
-        "StadLab/CarRacing-v3",
-        "stad_lab.envs.car_racing:CarRacing",
-        vector_entry_point="stad_lab.envs.vector:CarRacingVector",
-        reward_threshold=900,
-        max_episode_steps=1000,
-    )
-    register("StadLab/Dream-v0", "stad_lab.dreaming:make_dream")
+register_when_used()

@@ -2,12 +2,25 @@
 
 import sys
 
+from stad_lab.streams import make_streams_last, open_missing_streams
+
+LONG = ("train", "fine-tune", "replicate", "latents", "probe-study", "probe")  # print progress
+
 if __name__ == "__main__":
+    open_missing_streams()
+    if sys.argv[1:2] and sys.argv[1] in LONG:
+        make_streams_last()
     if sys.argv[1:] == ["check"]:  # it must run where the command line's own packages are missing
         from stad_lab.doctor import tell_environment
 
         sys.stdout.reconfigure(errors="backslashreplace")  # for letters that a console lacks
         sys.exit(tell_environment())
-    from stad_lab.cli import main
-
+    try:
+        from stad_lab.cli import main
+    except KeyboardInterrupt:  # which `main` itself handles
+        print("\nstopped", file=sys.stderr)
+        sys.exit(130)
+    except ModuleNotFoundError as error:
+        print(f"error: {error}: pip install 'stad_lab[train]'", file=sys.stderr)
+        sys.exit(2)
     sys.exit(main())

@@ -12,11 +12,11 @@ from typing import NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
-import torch
 
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
-from stad_lab.envs.frames import FRAME_SIZE, FrameMemory, earlier_frames, to_frame, to_pictures
+from stad_lab.envs.frames import FRAME_SIZE, FrameMemory, to_frame
+from stad_lab.features import encode_episode, features_of, remember_episode  # noqa: F401
 from stad_lab.inference import Inference
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
@@ -27,11 +27,8 @@ from stad_lab.io.weights import (
 )
 from stad_lab.io.workers import check_cancelled
 from stad_lab.models.controller import check_parameters, control, parameter_count
-from stad_lab.models.mdn_rnn import MDNRNN
-from stad_lab.models.vae import VAE, to_tensor
 
 PRETRAINED = Path(__file__).parent / "pretrained"
-CHUNK = 250  # frames of an episode that V encodes at once
 
 
 class Agent:
@@ -198,8 +195,9 @@ def rollout(
         patience: an episode ends after so many frames without a new tile; 0 for never.
         observe: called before every step with the numbers of the cars, what they see, and actions.
     """
-    if max_frames < 1:
-        raise ValueError(f"max_frames={max_frames}: expected at least 1")
+    for name, value, least in (("max_frames", max_frames, 1), ("patience", patience, 0)):
+        if not isinstance(value, int | np.integer) or value < least:
+            raise ValueError(f"{name}={value!r}: expected at least {least}, a whole number")
     returns, rewards = np.zeros(len(batch)), [[] for _ in range(len(batch))]
     last_tile = np.zeros(len(batch), int)  # the frame in which a car last reached a new tile
     driving = np.arange(len(batch))
@@ -233,11 +231,12 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
         fast: use our engine, which draws the agent's frames directly, not Gymnasium's environment.
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
     """
-    tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
-    if not tracks:
+    if not len(tracks):
         raise ValueError("tracks is empty: expected the seed of at least one track")
-    if min(tracks) < 0:
-        raise ValueError(f"track {min(tracks)}: expected at least 0, the seed of a track")
+    for track in tracks:
+        if not isinstance(track, int | np.integer) or track < 0:
+            raise ValueError(f"track {track!r}: expected at least 0, a whole number")
+    tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
     if fast:
         cars = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)
         cars.reset(tracks)
@@ -246,34 +245,6 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
         envs = [stack.enter_context(make_env(fast=False)) for _ in tracks]
         first = [env.reset(seed=track)[0] for env, track in zip(envs, tracks, strict=True)]
         return rollout(agent, EnvBatch(envs, first), **limits)
-
-
-@torch.no_grad()
-def encode_episode(vae: VAE, frames: np.ndarray, stride: int) -> np.ndarray:
-    """V's mu and logvar for the frames of an episode, uint8 (T, 64, 64, 3) -> float32 (2, T, z)."""
-    device, count = next(vae.parameters()).device, max(1, len(frames) // CHUNK)
-    parts, earlier = [], earlier_frames(frames, stride)
-    for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
-        pictures = (to_tensor(picture).to(device) for picture in to_pictures(*pair))
-        parts.append(torch.stack(vae.encode(*pictures)))
-    return torch.cat(parts, dim=1).cpu().numpy()
-
-
-@torch.no_grad()
-def remember_episode(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """M's memory before every frame of an episode, which C sees with that frame's z.
-
-    float32 (T, latent_size) and (T, 3) -> (T, hidden_size); the first row is zero.
-    """
-    after, _ = mdn_rnn.remember(torch.from_numpy(latents)[None], torch.from_numpy(actions)[None])
-    return torch.cat([torch.zeros_like(after[:, :1]), after[:, :-1]], dim=1)[0].numpy()
-
-
-def features_of(world_model: WorldModel, frames: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """What C sees in an episode, z and the h before it: float32 (T, latent_size + hidden_size)."""
-    latents = encode_episode(world_model.vae, frames, world_model.stride)[0]
-    hidden = remember_episode(world_model.mdn_rnn, latents, actions)
-    return np.concatenate([latents, hidden], axis=1)
 
 
 def shipped_agents() -> list[str]:

@@ -278,7 +278,7 @@ def measure_training(rounds: int) -> dict:
 
 def v_speed(config: Config, dataset: Dataset, number: int) -> float:
     """Images a second of V in training."""
-    vae = VAE(config.variant, config.vae.latent_size, config.vae.width)
+    vae = VAE.of(config)
     vae.to(memory_format=torch.channels_last)
     return training_speed(vae_training(config, dataset, vae, Path("unused")), config.vae.batch)
 
@@ -289,7 +289,7 @@ def m_speed(config: Config, number: int) -> float:
     rng, count = np.random.default_rng(number), settings.sequence + 1
     encoded = [rng.standard_normal((2, count, size), np.float32) for _ in range(4)]
     latents = Latents(encoded, [np.zeros((count, 3), np.float32)] * 4, 3, "")
-    mdn_rnn = MDNRNN(size, settings.hidden_size, settings.mixtures)
+    mdn_rnn = MDNRNN.of(config)
     training = mdn_rnn_training(config, latents, mdn_rnn, Path("unused"))
     return training_speed(training, settings.batch * settings.sequence)
 

@@ -7,6 +7,7 @@ What a command needs is imported when it is called, so that `check` runs where P
 import contextlib
 import functools
 import io
+import itertools
 import re
 import sys
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from stad_lab.config import PRESETS, Config
+from stad_lab.config import PRESETS, REPORTED_TRACKS, STUDY_TRACKS, Config
 
 CONTINUES = (
     "train",
@@ -58,10 +59,12 @@ def parse(arguments: list[str]) -> Callable[[], int | None]:
     tyro calls a command as soon as it has parsed it; this defers it, so that only what the parser
     writes is caught. Wrong usage raises ValueError with one line.
     """
-    preset = None
-    if arguments[:1] == ["train"] and len(arguments) > 1 and not arguments[1].startswith("-"):
-        preset, arguments = arguments[1], ["train", *arguments[2:]]
-    commands = COMMANDS | {"train": training_command(Config.preset(preset))}
+    command, commands = arguments[0] if arguments else "", COMMANDS
+    if command and not command.startswith("-") and command not in COMMANDS:
+        raise ValueError(f"unknown command {command!r}: choose one of {', '.join(COMMANDS)}")
+    if command == "train":
+        preset, arguments = take_preset(arguments)
+        commands = COMMANDS | {"train": training_command(Config.preset(preset))}
     told = io.StringIO()
     try:
         with contextlib.redirect_stderr(told):
@@ -76,6 +79,18 @@ def parse(arguments: list[str]) -> Callable[[], int | None]:
         if not ended.code:
             raise
         raise ValueError(f"{one_line(told.getvalue())}; see {PROGRAM} --help") from None
+
+
+def take_preset(arguments: list[str]) -> tuple[str | None, list[str]]:
+    """The preset that the arguments of `train` name, and the others: "train --out RUN quick", too.
+
+    Whatever follows `train` is one, so that a misspelt preset is refused as such.
+    """
+    for place, (before, one) in enumerate(itertools.pairwise(arguments), 1):
+        first = place == 1 and not one.startswith("-")
+        if first or (one in PRESETS and not before.startswith("-")):
+            return one, [*arguments[:place], *arguments[place + 1 :]]
+    return None, arguments
 
 
 def deferred(command: Callable) -> Callable:
@@ -104,8 +119,8 @@ def explain(error: Exception) -> str | None:
     torch_is_short = isinstance(error, RuntimeError) and short  # PyTorch has no error of its own
     if isinstance(error, MemoryError | OverflowError) or torch_is_short:
         return f"too large for this machine: {error or type(error).__name__}"
-    if isinstance(error, ModuleNotFoundError) and error.name in EXTRAS:
-        return f"{error}: pip install 'stad_lab[{EXTRAS[error.name]}]'"
+    if isinstance(error, ModuleNotFoundError) and "pip install" not in str(error):
+        return f"{error}: pip install 'stad_lab[{EXTRAS.get(error.name, 'train')}]'"
     known = ValueError, OSError, FloatingPointError, ImportError
     if isinstance(error, known) or type(error).__name__ == "TaskError":
         return str(error)
@@ -220,8 +235,8 @@ def fine_tune(
 
 def evaluate(
     agent: str,
-    episodes: int = 100,
-    first_track: int = 0,
+    episodes: int = len(REPORTED_TRACKS),
+    first_track: int = REPORTED_TRACKS.start,
     fast: bool = False,
     processes: int = 2,
     json: Path | None = None,
@@ -245,8 +260,8 @@ def evaluate(
     from stad_lab.io.files import save_json
 
     load_agent(agent)
-    other = "-fast" * fast + f"-from-{first_track}" * (first_track != 0)
-    other += f"-{episodes}-tracks" * (episodes != 100)
+    other = "-fast" * fast + f"-from-{first_track}" * (first_track != REPORTED_TRACKS.start)
+    other += f"-{episodes}-tracks" * (episodes != len(REPORTED_TRACKS))
     file = result_file(json, agent, "evaluation", other)
     unfinished = file.with_name(f"unfinished-{file.name}")
     with cluster_of(scheduler) as executor:
@@ -324,8 +339,8 @@ def replicate(
 
 def evaluate_study(
     study: tyro.conf.Positional[str],
-    first_track: int = 1000,
-    episodes: int = 400,
+    first_track: int = STUDY_TRACKS.start,
+    episodes: int = len(STUDY_TRACKS),
     seeds: list[int] | None = None,
     only: list[str] | None = None,
     json: Path | None = None,

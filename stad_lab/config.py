@@ -124,7 +124,7 @@ class EvolutionConfig:
     components: int = 48
     """Optimise along so many principal components of what C sees, at most; 0 for every weight."""
     features: Literal["z, h", "z", "h"] = "z, h"
-    """What C sees."""
+    """What C sees: "z, h" with its quotes, z or h."""
     initial_gas: float = -0.5
     """Gas output of the first controller before squashing; (tanh(-0.5) + 1) / 2 is 27% gas."""
     patience: int = 100
@@ -200,7 +200,8 @@ def with_values(base: Any, values: dict) -> Any:
         if name not in known:
             raise ValueError(f"unknown setting {name!r}: expected one of {', '.join(known)}")
         stage = getattr(base, name)
-        changed[name] = with_values(stage, value) if isinstance(value, dict) else value
+        nested = isinstance(value, dict) and dataclasses.is_dataclass(stage)
+        changed[name] = with_values(stage, value) if nested else value
     return dataclasses.replace(base, **changed)
 
 
@@ -301,6 +302,9 @@ TRACK_RANGES = {
     "validate": (3_000_000, 4_000_000),
     "inspect": (4_000_000, 5_000_000),
 }
+
+# Of the tracks for tests: those of a reported evaluation, and of the studies' scores.
+REPORTED_TRACKS, STUDY_TRACKS = range(100), range(1000, 1400)
 
 
 def track_seeds(use: str, count: int, seed: int = 0, *numbers: int) -> list[int]:

@@ -21,7 +21,8 @@ COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
 LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = ("numpy", "scipy", "pandas", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma")
-MODULES += ("safetensors", "psutil", "tyro")
+MODULES += ("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl")
+NEEDED = ("", "train")  # extras without which the notebooks do not run
 OPTIONAL_MODULES = ("matplotlib", "PIL", "sklearn", "ipywidgets", "distributed")  # of the extras
 
 
@@ -127,13 +128,15 @@ def check_packages() -> Iterator[Line]:
     for requirement in map(Requirement, requires("stad_lab")):
         marker, name = requirement.marker, requirement.name
         found = installed_version(name)
-        if not marker or marker.evaluate({"extra": ""}):
+        if not marker or any(marker.evaluate({"extra": extra}) for extra in NEEDED):
             yield compare(name, found, str(requirement.specifier), INSTALL)
         elif found is None or not requirement.specifier.contains(found, prereleases=True):
             for extra in extras:
                 if marker.evaluate({"extra": extra}):
                     extras[extra].append(f"{name} ({found or 'missing'})")
     for extra, lacking in extras.items():
+        if extra in NEEDED:
+            continue
         found = f"incomplete: {', '.join(lacking)}" if lacking else "complete"
         remedy = f"only if you need this extra: pip install 'stad_lab[{extra}]'"
         yield judge(not lacking, f"extra {extra}", found, remedy, AMBER)

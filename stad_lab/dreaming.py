@@ -7,18 +7,25 @@ import torch
 
 from stad_lab.agent import Agent, EnvBatch, rollout, run_folder
 from stad_lab.envs.dream import DreamEnv
+from stad_lab.envs.dreams import DreamVector
 from stad_lab.io.weights import load_world_model
 from stad_lab.models.controller import control
 from stad_lab.models.mdn_rnn import to_state
 
 
-def make_dream(source: str | Path = "frame", **options) -> DreamEnv:
+def make_dream(agent: str | Path = "frame", temperature: float = 1.0, **options) -> DreamEnv:
     """The dream of an agent; `gymnasium.make("stad_lab:StadLab/Dream-v0")` calls this.
 
-    `source` is a shipped agent, or the folder of a run with V and M; the options are `DreamEnv`'s.
+    `agent` is a shipped agent, or the folder of a run with V and M; the options are `DreamEnv`'s.
     """
-    world_model = load_world_model(run_folder(source))
-    return DreamEnv(world_model.vae, world_model.mdn_rnn, **options)
+    world_model = load_world_model(run_folder(agent))
+    return DreamEnv(world_model.vae, world_model.mdn_rnn, temperature, **options)
+
+
+def make_dreams(agent: str | Path = "frame", **options) -> DreamVector:
+    """Many dreams of an agent, as `make_dream`; the options are `DreamVector`'s."""
+    world_model = load_world_model(run_folder(agent))
+    return DreamVector(world_model.vae, world_model.mdn_rnn, **options)
 
 
 class Dreamer:

@@ -15,6 +15,7 @@ A sum is made in one order, whatever the batch or the width of the processor's v
 numbers do not depend on the other cars of the batch.
 """
 
+import copy
 import functools
 import itertools
 from typing import NamedTuple
@@ -27,13 +28,13 @@ from numba.core.codegen import get_host_cpu_features
 from numba.extending import intrinsic
 
 from stad_lab.envs.compiling import compiled
-from stad_lab.envs.frames import FRAME_SIZE, normalise
-from stad_lab.models.mdn_rnn import MDNRNN
-from stad_lab.models.vae import VAE
+from stad_lab.envs.frames import FRAME_SIZE, normalise, to_pictures
+from stad_lab.models.mdn_rnn import MDNRNN, to_state
+from stad_lab.models.vae import VAE, to_tensor
 
 PATCHES, OUTPUTS = 6, 16  # of a tile: 12 vectors of AVX2, which has 16 registers
 BLOCKS = 2 if "+avx512f" in get_host_cpu_features() else 1  # of OUTPUTS in a tile: 12 of 32 vectors
-KERNEL, STRIDE = 4, 2  # of V's convolutions
+TOLERANCE = 1e-3  # between the compiled numbers and PyTorch's, as a share of the largest
 PIXELS = normalise(np.arange(256, dtype=np.uint8))  # every value that a pixel of a frame can have
 
 
@@ -201,12 +202,16 @@ class Inference:
     """V's encoder and M's memory for driving. It has memory to work in: one for each thread.
 
     Weights are copied: an Inference does not follow a training.
+
+    Raises:
+        ValueError: a network of another architecture than what is compiled here.
     """
 
     def __init__(self, vae: VAE, mdn_rnn: MDNRNN):
-        self.channels, self.latent_size = 6 if vae.sees_difference else 3, vae.latent_size
-        self.encoder, self.memory = pack_encoder(vae, self.channels), pack_memory(mdn_rnn)
+        self.channels, self.latent_size = vae.encoder[0].in_channels, vae.latent_size
+        self.encoder, self.memory = pack_encoder(vae), pack_memory(mdn_rnn)
         self.cars = 0
+        compare(self, vae, mdn_rnn)
 
     def encode(self, frames: np.ndarray, earlier: np.ndarray) -> np.ndarray:
         """V's mean mu of z, float32 (cars, latent_size).
@@ -240,11 +245,11 @@ class Inference:
         if cars == self.cars:
             return
         self.cars, size, channels, layers = cars, FRAME_SIZE, self.channels, []
-        for weights, bias in self.encoder[:-1]:
-            starts = convolution_starts(cars, size, channels)
-            shape = KERNEL, size * channels, KERNEL * channels
+        for weights, bias, kernel, stride in self.encoder[:-1]:
+            starts = convolution_starts(cars, size, channels, kernel, stride)
+            shape = kernel, size * channels, kernel * channels
             layers.append(Layer(starts, *shape, weights, bias, 0.0))
-            size, channels = (size - KERNEL) // STRIDE + 1, len(bias)
+            size, channels = (size - kernel) // stride + 1, len(bias)
         layers.append(dense_layer(cars, *self.encoder[-1]))
         self._layers, self._memory = tuple(layers), dense_layer(cars, *self.memory)
         largest = max(len(layer.starts) * len(layer.bias) for layer in layers)
@@ -264,32 +269,89 @@ def pack(weights: np.ndarray, bias: np.ndarray) -> Packed:
     return np.ascontiguousarray(tiles), np.pad(bias, (0, missing)).astype(np.float32)
 
 
-def pack_encoder(vae: VAE, channels: int) -> list[Packed]:
-    """The layers of V's encoder, of the last one the outputs for mu."""
-    *convolutions, last = [part for part in vae.encoder if hasattr(part, "weight")]
-    packed, kernels = [], [part.weight for part in convolutions]
-    kernels.append(last.weight[: vae.latent_size].unflatten(1, (-1, 2, 2)))
-    for part, kernel in zip([*convolutions, last], kernels, strict=True):
-        kernel = kernel.detach().cpu().permute(2, 3, 1, 0).numpy()  # channels last, then outputs
-        missing = channels - kernel.shape[2]  # channels that the layer before was filled up with
-        kernel = np.pad(kernel, ((0, 0), (0, 0), (0, missing), (0, 0)))
-        count = kernel.shape[3]
-        bias = part.bias.detach().cpu().numpy()[:count]
-        packed.append(pack(kernel.reshape(-1, count), bias))
-        channels = len(packed[-1][1])
+def pack_encoder(vae: VAE) -> list[tuple]:
+    """The layers of V's encoder: (weights, bias, kernel, stride), and of the last one for mu.
+
+    ValueError unless they are convolutions without padding, each with a ReLU, and a linear layer.
+    """
+    *parts, _, last = vae.encoder
+    convolutions, activations, packed, size = parts[::2], parts[1::2], [], FRAME_SIZE
+    kinds = [type(part).__name__ for part in vae.encoder]
+    if kinds != [*["Conv2d", "ReLU"] * len(activations), "Flatten", "Linear"]:
+        raise refused("V", f"an encoder of {', '.join(kinds)}")
+    if (channels := convolutions[0].in_channels) not in (3, 6):
+        raise refused("V", f"{channels} input channels")
+    for part in convolutions:
+        kernel, stride = part.kernel_size[0], part.stride[0]
+        usual = torch.nn.Conv2d(part.in_channels, part.out_channels, kernel, stride)
+        if str(part) != str(usual) or part.bias is None:
+            raise refused("V", str(part))
+        packed.append((*pack_convolution(part.weight, part.bias, channels), kernel, stride))
+        size, channels = (size - kernel) // stride + 1, len(packed[-1][1])
+    kernel = last.weight[: vae.latent_size].unflatten(1, (-1, size, size))
+    packed.append(pack_convolution(kernel, last.bias[: vae.latent_size], channels))
     return packed
 
 
+@torch.no_grad()
+def pack_convolution(kernel: torch.Tensor, bias: torch.Tensor, channels: int) -> Packed:
+    """A kernel (outputs, inputs, rows, columns) with its inputs filled up to `channels`."""
+    kernel = kernel.cpu().permute(2, 3, 1, 0).numpy()  # channels last, then outputs
+    kernel = np.pad(kernel, ((0, 0), (0, 0), (0, channels - kernel.shape[2]), (0, 0)))
+    return pack(kernel.reshape(-1, len(bias)), bias.cpu().numpy())
+
+
+@torch.no_grad()
 def pack_memory(mdn_rnn: MDNRNN) -> Packed:
-    """M's LSTM: both of its matrices as one, for z, the action and h side by side."""
+    """M's LSTM: both of its matrices as one, for z, the action and h side by side.
+
+    ValueError unless it is one layer of an LSTM without extras.
+    """
     lstm = mdn_rnn.lstm
-    weights = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], 1).detach().cpu().numpy()
-    return pack(weights.T, (lstm.bias_ih_l0 + lstm.bias_hh_l0).detach().cpu().numpy())
+    if str(lstm) != str(torch.nn.LSTM(lstm.input_size, lstm.hidden_size, batch_first=True)):
+        raise refused("M", str(lstm))
+    weights = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], 1).cpu().numpy()
+    return pack(weights.T, (lstm.bias_ih_l0 + lstm.bias_hh_l0).cpu().numpy())
 
 
-def convolution_starts(cars: int, size: int, channels: int) -> np.ndarray:
+@torch.no_grad()
+def compare(inference: Inference, vae: VAE, mdn_rnn: MDNRNN) -> None:
+    """Encode and remember once, by chance, here and in PyTorch; ValueError if they differ."""
+    rng, hidden_size = np.random.default_rng(0), mdn_rnn.hidden_size
+    frames, earlier = rng.integers(0, 256, (2, 1, FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+    actions, memory = np.ones((1, 3), np.float32), np.zeros((2, 1, hidden_size), np.float32)
+    vae, mdn_rnn = on_cpu(vae), on_cpu(mdn_rnn)
+    latents = inference.encode(frames, earlier)
+    check_equal("V", latents, vae.encode(*map(to_tensor, to_pictures(frames, earlier)))[0])
+    memory = inference.remember(latents, actions, memory)
+    seen = [torch.from_numpy(part)[:, None] for part in (latents, actions)]
+    after = mdn_rnn.remember(*seen, to_state(memory))[1]
+    check_equal("M", inference.remember(latents, actions, memory), torch.cat(after))
+
+
+def on_cpu(network: torch.nn.Module) -> torch.nn.Module:
+    """The network itself, or a copy of one on a GPU."""
+    here = next(network.parameters()).device.type == "cpu"
+    return network if here else copy.deepcopy(network).cpu()
+
+
+def check_equal(network: str, ours: np.ndarray, theirs: torch.Tensor) -> None:
+    """Raise ValueError unless compiled numbers are PyTorch's, up to rounding."""
+    error = TOLERANCE * float(theirs.abs().nan_to_num().max())
+    if ours.shape != theirs.shape or not np.allclose(ours, theirs, 0, error, equal_nan=True):
+        raise refused(network, "numbers that the compiled ones do not equal")
+
+
+def refused(network: str, found: str) -> ValueError:
+    """The error for a network that is not compiled here."""
+    return ValueError(
+        f"{network} has {found}: what drives is compiled in inference.py, change both"
+    )
+
+
+def convolution_starts(cars: int, size: int, channels: int, kernel: int, stride: int) -> np.ndarray:
     """Where the patches of a convolution begin, in pictures of `size` x `size` pixels."""
-    steps = np.arange(0, size - KERNEL + 1, STRIDE)
+    steps = np.arange(0, size - kernel + 1, stride)
     pixels = (np.arange(cars)[:, None, None] * size + steps[:, None]) * size + steps
     return pixels.ravel() * channels
 

@@ -267,6 +267,10 @@ def test_tracks_may_be_numpy_s_integers_none_is_below_zero_and_there_is_one(agen
     assert np.array_equal(*found)
     with pytest.raises(ValueError, match="track -1: expected at least 0"):
         drive(agent, [3, -1])
+    with pytest.raises(ValueError, match=r"track 1\.5: expected at least 0, a whole number"):
+        drive(agent, [1.5])
+    with pytest.raises(ValueError, match="patience=-1: expected at least 0"):
+        drive(agent, [1], patience=-1)
     with pytest.raises(ValueError, match="tracks is empty"):
         drive(agent, [])
 

@@ -17,7 +17,7 @@ from PIL import Image, ImageSequence
 from stad_lab import cli
 from stad_lab.cli import COMMANDS, main, parse
 from stad_lab.config import PRESETS, VARIANTS, Config, fields_of
-from stad_lab.io.files import load_json, save_json
+from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors
 from stad_lab.io.weights import (
     load_vae,
     load_world_model,
@@ -25,6 +25,7 @@ from stad_lab.io.weights import (
     save_mdn_rnn,
     save_vae,
 )
+from stad_lab.io.workers import TaskError
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training.pipeline import STAGES
@@ -297,6 +298,7 @@ def test_a_wrong_name_or_value_ends_in_one_clear_line(options, parts, tmp_path, 
     ("command", "message"),
     [
         ("train fast --out run", "unknown preset 'fast': choose one of quick, laptop, paper"),
+        ("compet --help", "unknown command 'compet': choose one of check, train"),
         ("train quick", "--out"),
         ("", "Missing subcommand"),
         ("driving", "driving"),
@@ -369,6 +371,27 @@ def test_a_run_of_another_configuration_ends_in_one_clear_line(option, value, wa
     assert states(run) == before
 
 
+def test_a_preset_may_stand_anywhere_and_a_wrong_one_in_the_environment_breaks_train_alone(
+    monkeypatch,
+):
+    for command in ("train quick --out run", "train --out run quick", "train --out quick quick"):
+        arguments = parse(command.split()).keywords
+        assert arguments["config"] == QUICK and arguments["out"] in ("run", "quick")
+    monkeypatch.setenv("STAD_LAB_PRESET", "bogus")
+    assert parse(["evaluate", "--agent", "frame"]).keywords["agent"] == "frame"
+    with pytest.raises(ValueError, match="unknown preset 'bogus'"):
+        parse(["train", "--out", "run"])
+
+
+@pytest.mark.parametrize(
+    "message",
+    ["could not create a primitive", "[enforce fail] DefaultCPUAllocator: can't allocate memory"],
+)
+def test_memory_that_is_too_short_is_named_as_such(message):
+    for error in (RuntimeError(message), TaskError(f"drive_group failed in a worker: {message}")):
+        assert cli.explain(error) == f"too large for this machine: {error}"
+
+
 @pytest.mark.parametrize("made", [True, False])
 def test_a_missing_or_empty_run_folder_ends_in_one_clear_line(made, tmp_path, capsys):
     folder = tmp_path / "run"
@@ -416,6 +439,14 @@ def test_training_on_top_of_weights_of_another_size_ends_in_one_clear_line(part,
     error = the_error(capsys, *train_quickly(run))
     assert f"{part}.safetensors was made with {part}." in error
     assert "_size=16" in error
+
+
+def test_weights_of_an_impossible_architecture_end_in_one_clear_line(run, capsys):
+    tensors, metadata = load_tensors(run / "vae.safetensors")
+    metadata["vae"]["width"] = "wide"
+    save_tensors(run / "vae.safetensors", tensors, **metadata)
+    error = the_error(capsys, *evaluate_quickly(run))
+    assert "vae.safetensors is not a file of this kind: vae.width='wide' is a str" in error
 
 
 def test_weights_that_do_not_fit_their_own_metadata_end_in_one_clear_line(run, capsys):

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from torch import nn
 
+from stad_lab.config import Config
 from stad_lab.envs.frames import to_pictures
 from stad_lab.inference import Inference
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE, VARIANTS, to_tensor
+from stad_lab.training.pipeline import train
 
 
 def make_inputs(cars, latent_size, hidden_size):
@@ -73,3 +76,66 @@ def test_an_inference_does_not_follow_a_training():
     for parameter in vae.parameters():
         parameter.data.zero_()
     assert np.array_equal(inference.encode(frames, earlier), before)
+
+
+class NewPictures(VAE):
+    """A V that sees the difference image twice as bright."""
+
+    def encode(self, frame, difference):
+        """As if the difference were twice as bright."""
+        return super().encode(frame, 2 * difference)
+
+
+def with_layer(number, layer):
+    """A V with another layer in its encoder."""
+    vae = VAE("input", 8, 4)
+    vae.encoder[number] = layer
+    return vae
+
+
+def with_lstm(**options):
+    """An M with another LSTM."""
+    mdn_rnn = MDNRNN(8, 16, 2)
+    mdn_rnn.lstm = nn.LSTM(8 + 3, 16, batch_first=True, **options)
+    return mdn_rnn
+
+
+@pytest.mark.parametrize("kernel", [3, 5, 6])
+@torch.no_grad()
+def test_other_kernels_and_strides_are_read_from_the_network(kernel):
+    torch.manual_seed(0)
+    vae = with_layer(0, nn.Conv2d(6, 4, kernel, stride=3))
+    vae.encoder[2] = nn.Conv2d(4, 8, 3, stride=1)
+    size = vae.encoder[:9](torch.zeros(1, 6, 64, 64)).shape[1]
+    vae.encoder[9] = nn.Linear(size, 16)
+    frames, earlier, *_ = make_inputs(2, 8, 16)
+    latents = Inference(vae, MDNRNN(8, 16, 2)).encode(frames, earlier)
+    expected = vae.encode(*map(to_tensor, to_pictures(frames, earlier)))[0].numpy()
+    assert np.abs(latents - expected).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("vae", "mdn_rnn", "message"),
+    [
+        (NewPictures("input", 8, 4), None, "V has numbers that the compiled ones do not equal"),
+        (with_layer(1, nn.ELU()), None, "V has an encoder of Conv2d, ELU"),
+        (with_layer(0, nn.Conv2d(6, 4, 4, 2, 1)), None, r"V has Conv2d.*padding=\(1, 1\)"),
+        (with_layer(0, nn.Conv2d(6, 4, (4, 2), 2)), None, r"V has Conv2d.*kernel_size=\(4, 2\)"),
+        (with_layer(0, nn.Conv2d(6, 4, 4, 2, bias=False)), None, "V has Conv2d.*bias=False"),
+        (with_layer(0, nn.Conv2d(9, 4, 4, 2)), None, "V has 9 input channels"),
+        (None, with_lstm(num_layers=2), "M has LSTM.*num_layers=2"),
+        (None, with_lstm(bidirectional=True), "M has LSTM.*bidirectional=True"),
+    ],
+)
+def test_a_network_that_is_not_compiled_is_refused_in_one_line(vae, mdn_rnn, message):
+    with pytest.raises(ValueError, match=f"{message}.*inference.py") as caught:
+        Inference(vae or VAE("input", 8, 4), mdn_rnn or MDNRNN(8, 16, 2))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_run_whose_v_could_not_drive_is_refused_before_it_begins(tmp_path, monkeypatch):
+    own = VAE.encode
+    monkeypatch.setattr(VAE, "encode", lambda vae, frame, other: own(vae, frame, 2 * other))
+    with pytest.raises(ValueError, match="V has numbers"):
+        train(Config.preset("quick"), tmp_path / "run")
+    assert not (tmp_path / "run").exists()

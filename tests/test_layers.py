@@ -116,3 +116,14 @@ def lines(files):
 
 def test_a_student_can_read_the_core_in_an_evening():
     assert lines(CORE) <= 1500, f"the core has {lines(CORE)} lines"
+
+
+def test_the_architecture_of_v_and_m_is_read_from_a_configuration_in_one_place():
+    """A new setting of V or M needs its network and nothing else: the rest calls `of`."""
+    calls = [
+        (name_of(file), ast.unparse(node.func))
+        for file in FILES
+        for node in ast.walk(parse(file))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in ("VAE", "MDNRNN")
+    ]
+    assert calls == []

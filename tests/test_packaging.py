@@ -19,9 +19,13 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 CORE = PYPROJECT["project"]["dependencies"]
-EXTRAS = PYPROJECT["project"]["optional-dependencies"]
+EXTRAS = {  # without the extras that an extra includes
+    extra: [one for one in some if not one.startswith("stad_lab[")]
+    for extra, some in PYPROJECT["project"]["optional-dependencies"].items()
+}
 GROUPS = PYPROJECT["dependency-groups"]
-MOST = 15  # packages that the core may need
+MOST = 4  # packages that the engine may need
+LISTED = ("train", "lab", "course", "cluster")  # extras that environment.txt brings
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
@@ -44,7 +48,7 @@ def normal(name):
 
 def test_environment_txt_has_the_packages_of_pyproject():
     installed = by_name(read_list("environment.txt"))
-    needed = [*CORE, *(one for extra in ("lab", "course", "cluster") for one in EXTRAS[extra])]
+    needed = [*CORE, *(one for extra in LISTED for one in EXTRAS[extra])]
     needed = by_name([*needed, *(one for group in GROUPS.values() for one in group)])
     assert installed.keys() == needed.keys()
     for name, requirement in installed.items():
@@ -61,12 +65,12 @@ def test_scores_can_be_reproduced_because_gymnasium_and_torch_are_pinned():
         assert str(installed[name].specifier).startswith("==")
 
 
-def test_the_core_is_small_and_has_nothing_for_tests_pages_courses_or_notebooks():
+def test_the_engine_needs_little_and_nothing_of_training_tests_pages_courses_or_notebooks():
     core = by_name(CORE)
     assert len(core) <= MOST
     others = [one for part in (EXTRAS, GROUPS) for some in part.values() for one in some]
     assert not core.keys() & by_name(others).keys()
-    assert set(EXTRAS) == {"lab", "course", "cluster", "benchmark"}
+    assert set(EXTRAS) == {"train", "lab", "course", "cluster", "benchmark"}
     assert set(GROUPS) == {"test", "docs", "lint"}
 
 
@@ -76,7 +80,7 @@ def test_every_range_has_an_upper_bound_and_box2d_py_is_not_required():
         assert "<" in str(requirement.specifier) and not name.startswith("box2d")
 
 
-def test_the_core_requires_every_package_that_the_library_imports():
+def test_the_library_requires_every_package_that_it_imports():
     distributions = importlib.metadata.packages_distributions()
     extras = {name for some in EXTRAS.values() for name in by_name(some)}
     brought = {"box2d", "pygame-ce"}  # by gymnasium[box2d]
@@ -133,16 +137,100 @@ def test_the_licences_of_all_that_is_installed_go_with_mit():
         assert not strict or free, (name, licences)
 
 
+BLOCK = """
+import importlib.metadata, sys
+
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {blocked!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+
+sys.meta_path.insert(0, Block())
+"""
+ENGINE = """
+import sys
+import gymnasium, numpy
+from gymnasium.utils.env_checker import check_env
+
+NAME = "stad_lab:StadLab/CarRacing-v3"
+check_env(gymnasium.make(NAME).unwrapped, skip_render_check=True)
+env = gymnasium.make(NAME, render_mode="rgb_array")
+env.reset(seed=1)
+assert env.render().shape == (400, 600, 3)
+envs = gymnasium.make_vec(NAME, num_envs=16, vectorization_mode="vector_entry_point")
+seen, _ = envs.reset(seed=1)
+for _ in range(3):
+    seen, rewards, *_ = envs.step(envs.action_space.sample())
+assert seen.shape == (16, 96, 96, 3) and rewards.shape == (16,)
+assert "torch" not in sys.modules
+"""
+RECORD = """
+from pathlib import Path
+env = gymnasium.make(NAME, render_mode="rgb_array", max_episode_steps=20)
+env = gymnasium.wrappers.RecordVideo(env, "films", episode_trigger=lambda episode: True)
+env.reset(seed=1)
+while not env.step(env.action_space.sample())[3]:
+    pass
+env.close()
+assert [*Path("films").glob("*.mp4")]
+"""
+
+
+def blocker():
+    """Code after which what the extras bring cannot be imported, as if it were not installed."""
+    modules = importlib.metadata.packages_distributions()
+    extras = {name for some in EXTRAS.values() for name in by_name(some)}
+    return BLOCK.format(
+        blocked={module for module, names in modules.items() if {*map(normal, names)} & extras}
+    )
+
+
+def run_code(code, **options):
+    """Run code in a fresh Python: the finished process."""
+    options = {"capture_output": True, "text": True, "timeout": 120} | options
+    return subprocess.run([sys.executable, "-c", code], **options)
+
+
+def test_the_engine_drives_where_nothing_but_its_own_packages_is_installed(tmp_path):
+    process = run_code(blocker() + ENGINE, cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+
+
+def test_without_the_extra_that_trains_a_message_names_it():
+    for code in ("from stad_lab import load_agent", "import runpy; runpy.run_module('stad_lab')"):
+        run = code if "runpy" not in code else f"{code[:-1]}, run_name='__main__')"
+        error = run_code(blocker() + run).stderr.splitlines()[-1]
+        assert error.endswith("pip install 'stad_lab[train]'"), error
+
+
+def test_the_controller_needs_numpy_alone():
+    code = "import sys, stad_lab.models.controller; print(*sys.modules)"
+    loaded = {name.partition(".")[0] for name in run_code(code).stdout.split()}
+    own = {normal(name) for some in (CORE, *EXTRAS.values()) for name in by_name(some)}
+    modules = importlib.metadata.packages_distributions()
+    assert {one for one in loaded if {*map(normal, modules.get(one, []))} & own} == {"numpy"}
+
+
+@pytest.mark.parametrize("first", ["import gymnasium; import stad_lab", "import stad_lab"])
+def test_the_environments_are_registered_whichever_is_imported_first(first):
+    names = "'StadLab/CarRacing-v3', 'StadLab/Dream-v0'"
+    code = f"{first}; import gymnasium; print(*map(gymnasium.spec, ({names})))"
+    assert run_code(code).stdout.count("EnvSpec") == 2
+
+
 @pytest.mark.long
-def test_with_the_core_alone_an_agent_drives_an_episode(tmp_path):
-    """A new environment gets the core's packages, which takes minutes."""
+def test_in_new_environments_the_engine_drives_and_with_train_an_agent_does(tmp_path):
+    """A new environment gets the engine's packages, then those of `train`, which takes minutes."""
     source = shutil.copytree(
         ROOT, tmp_path / "source", ignore=shutil.ignore_patterns(".*", "notebooks", "docs", "build")
     )
     python = tmp_path / "venv" / "bin" / "python"
     run = {"check": True, "cwd": tmp_path, "timeout": 1800, "text": True}
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], **run)
-    subprocess.run([python, "-m", "pip", "install", "-q", source], **run)
+    subprocess.run([python, "-m", "pip", "install", "-q", source, "moviepy"], **run)
+    missing = "import importlib.util; assert not importlib.util.find_spec('torch')"
+    subprocess.run([python, "-c", missing + ENGINE + RECORD], **run)
+    subprocess.run([python, "-m", "pip", "install", "-q", f"{source}[train]"], **run)
     code = """
 import importlib.util
 from stad_lab import load_agent

@@ -12,10 +12,12 @@ import numpy as np
 from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
 
-from stad_lab.envs import physics, picture
-from stad_lab.envs.cars import Cars, pose_on, road_polygons
-from stad_lab.envs.frames import OBSERVATION_SHAPE
-from stad_lab.envs.track import tile_colors
+from stad_lab.envs import physics
+from stad_lab.envs.cars import Cars, check_rules, pose_on
+from stad_lab.envs.frames import OBSERVATION_SIZE
+from stad_lab.envs.own_track import Checkpoints
+from stad_lab.envs.views import View
+from stad_lab.envs.window import Window
 
 MAX_FRAMES = 1000  # Gymnasium's time limit for CarRacing, in frames
 FAST_ID = "StadLab/CarRacing-v3"
@@ -35,7 +37,7 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
         [-1, 1], gas and brake in [0, 1]. An episode is cut at 1,000 frames.
 
     Raises:
-        ValueError: an option that the environment does not have.
+        ValueError: an option that the environment does not have, or another value of it.
     """
     options = inspect.signature(CarRacing if fast else reference.CarRacing).parameters
     options = [*options, "max_episode_steps", "disable_env_checker"]
@@ -44,6 +46,8 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
             f"make_env: unknown {', '.join(unknown)}; choose from {', '.join(options)}. The seed of"
             " a track belongs to reset: env.reset(seed=1)"
         )
+    rules = ("continuous", "lap_complete_percent", "domain_randomize", "bar")
+    check_rules(**{name: kwargs[name] for name in rules if name in kwargs})
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
 
 
@@ -73,13 +77,19 @@ def place_car(
     return racing._render("state_pixels")
 
 
-def spaces(continuous: bool = True) -> tuple[gym.Space, gym.Space]:
-    """The observation space and the action space of one car, as Gymnasium's."""
-    seen = gym.spaces.Box(0, 255, OBSERVATION_SHAPE, np.uint8)
+def action_space(continuous: bool = True) -> gym.Space:
+    """The action space of one car, as Gymnasium's."""
     if not continuous:
-        return seen, gym.spaces.Discrete(5)
+        return gym.spaces.Discrete(5)
     low, high = np.array([-1, 0, 0], np.float32), np.ones(3, np.float32)
-    return seen, gym.spaces.Box(low, high)
+    return gym.spaces.Box(low, high)
+
+
+def check_skip(frame_skip: int) -> int:
+    """The number of frames of a step. ValueError if it is not a whole number from 1 on."""
+    if not isinstance(frame_skip, int | np.integer) or frame_skip < 1:
+        raise ValueError(f"frame_skip={frame_skip!r}: expected a whole number from 1 on")
+    return int(frame_skip)
 
 
 class CarRacing(gym.Env, gym.utils.EzPickle):
@@ -90,6 +100,12 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
             Gymnasium, without skid marks; or None.
         bar: whether to draw the indicator bar. Without it the lowest 12 rows are black.
         continuous, lap_complete_percent, domain_randomize: as Gymnasium's.
+        observes: "picture"; "state", float32 (10,), see `envs.state.STATE`; or "above", the whole
+            track and the car from above.
+        size: of a picture, pixels, 32 to 512. Our engine draws 96, Gymnasium's slower code others.
+        frame_skip: frames that a step repeats its action for; only the last is drawn. Gymnasium
+            limits an episode by steps: give `max_episode_steps` of `make`, too.
+        track: checkpoints of your own track, see `envs.own_track`; None for the track of a seed.
 
     Attributes:
         cars: the engine's `Cars`, with this car as number 0.
@@ -104,16 +120,22 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         continuous: bool = True,
         lap_complete_percent: float = 0.95,
         domain_randomize: bool = False,
+        observes: str = "picture",
+        size: int = OBSERVATION_SIZE,
+        frame_skip: int = 1,
+        track: Checkpoints | None = None,
     ):
         rules = (continuous, lap_complete_percent, domain_randomize)
-        gym.utils.EzPickle.__init__(self, render_mode, bar, *rules)
+        added = (observes, size, frame_skip, track)
+        gym.utils.EzPickle.__init__(self, render_mode, bar, *rules, *added)
         if render_mode not in (None, *RENDER_MODES):
             raise ValueError(
                 f"render_mode={render_mode!r}: expected one of {RENDER_MODES}, or None"
             )
         self.render_mode, self.continuous = render_mode, continuous
-        self.observation_space, self.action_space = spaces(continuous)
-        self.cars: Cars | None = Cars(1, "observation", bar, *rules)
+        self.view, self.frame_skip = View(observes, size, bar), check_skip(frame_skip)
+        self.observation_space, self.action_space = self.view.space, action_space(continuous)
+        self.cars: Cars | None = Cars(1, "observation", bar, *rules, track)
         self._window: Window | None = None
         self._started = False
 
@@ -130,7 +152,7 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         self.cars.reset(randomize=(options or {}).get("randomize", True))
         self._started = True
         self._show()
-        return self.cars.draw()[0], {}
+        return self.view.look(self.cars)[0], {}
 
     def step(self, action: np.ndarray | int) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Drive one frame: (observation, reward, terminated, False, info).
@@ -141,10 +163,15 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         """
         self._check_begun("step")
         rewards, ended = self.cars.step(np.asarray(action)[None])
+        for _ in range(self.frame_skip - 1):
+            if not ended[0]:
+                further, ended = self.cars.step(np.asarray(action)[None])
+                rewards += further
         ending = self.cars.cars["ending"][0]
         info = {"lap_finished": bool(ending == physics.LAP_FINISHED)} if ended[0] else {}
         self._show()
-        return self.cars.draw()[0], float(rewards[0]), bool(ended[0]), False, info
+        seen = self.view.look(self.cars)[0]
+        return seen, float(rewards[0]), bool(ended[0]), False, info
 
     @property
     def track(self) -> np.ndarray:
@@ -162,7 +189,7 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         """Put the car on a tile, as `Cars.place`; returns the observation there."""
         self._check_begun("place")
         self.cars.place(0, tile, *how, **named)
-        return self.cars.draw()[0]
+        return self.view.look(self.cars)[0]
 
     def render(self) -> np.ndarray | None:
         """Gymnasium's window: uint8 (400, 600, 3) for "rgb_array"; None for "human"."""
@@ -177,7 +204,8 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
     def close(self) -> None:
         """Release the window and the memory of the track."""
         if self._window is not None:
-            self._window.env.close()
+            self._window.close()
+        self.view.close()
         self.cars = self._window = None
 
     def _show(self) -> None:
@@ -192,49 +220,3 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
     def _check_open(self) -> None:
         if self.cars is None:
             raise RuntimeError("the environment is closed: make a new one")
-
-
-class Window:
-    """Draws car number 0 in the window of Gymnasium's own environment."""
-
-    def __init__(self, mode: str):
-        self.mode = mode
-        self.env = reference.CarRacing(render_mode=mode)
-        self.env.car, self.track = None, None
-
-    def draw(self, cars: Cars) -> np.ndarray | None:
-        """Copy the state of the car and draw it with Gymnasium's code."""
-        env, state = self.env, cars.cars[0]
-        env.t, env.reward = float(state["time"]), float(state["reward"])
-        env.road_color, env.bg_color, env.grass_color = (
-            cars.colors[name][0] for name in ("road", "background", "grass")
-        )
-        env.road_poly = road_of(cars)
-        if env.car is None:
-            env.car = car_dynamics.Car(env.world, 0.0, 0.0, 0.0)
-        for body, (position, angle) in zip(
-            [env.car.hull, *env.car.wheels],
-            zip(state["position"].tolist(), state["angle"].tolist(), strict=True),
-            strict=True,
-        ):
-            body.position, body.angle = position, angle
-        env.car.hull.linearVelocity = state["velocity"][0, :2].tolist()
-        env.car.hull.angularVelocity = float(state["velocity"][0, 2])
-        for wheel, omega, phase in zip(
-            env.car.wheels, state["omega"].tolist(), state["phase"].tolist(), strict=True
-        ):
-            wheel.omega, wheel.phase = omega, phase
-        return env._render(self.mode)
-
-
-def road_of(cars: Cars) -> list[tuple]:
-    """Polygons and colours of the road of car number 0, as Gymnasium's `road_poly`."""
-    track, road, color = cars.tracks[0], cars.roads[0], cars.colors["road"][0]
-    colors = tile_colors(len(track.tiles), color)
-    colors[road["darkened"][: len(colors)] > 0] = color
-    polygons, kinds = road_polygons(track)
-    kerbs, tiles = {picture.WHITE: (255, 255, 255), picture.RED: (255, 0, 0)}, iter(colors.tolist())
-    return [
-        (corners, kerbs.get(kind) or next(tiles))
-        for corners, kind in zip(polygons.tolist(), kinds.tolist(), strict=True)
-    ]

@@ -9,6 +9,7 @@ from gymnasium.utils import seeding
 from stad_lab.envs import physics, picture
 from stad_lab.envs.compiling import announced
 from stad_lab.envs.frames import FRAME_SIZE, OBSERVATION_SIZE
+from stad_lab.envs.own_track import Checkpoints, make_own_track
 from stad_lab.envs.track import MAX_TILES, TRACK_WIDTH, Track, make_track
 
 # Steering, gas and brake of Gymnasium's five discrete actions: nothing, right, left, gas, brake.
@@ -36,9 +37,10 @@ class Cars:
             int (n,), 0 to 4.
         lap_complete_percent: as in Gymnasium, from 0 to 1.
         domain_randomize: whether each episode has its own random colours.
+        track: checkpoints of a track for all episodes, see `own_track`; None for that of a seed.
 
     Raises:
-        ValueError: another share of a lap.
+        ValueError: as `check_rules` and `make_own_track`.
 
     Attributes:
         cars: `physics.CAR` (count,), the state of each car; see there.
@@ -58,13 +60,14 @@ class Cars:
         continuous: bool = True,
         lap_complete_percent: float = 0.95,
         domain_randomize: bool = False,
+        track: Checkpoints | None = None,
     ):
-        if not 0 <= lap_complete_percent <= 1:
-            raise ValueError(f"lap_complete_percent={lap_complete_percent}: expected 0 to 1")
+        check_rules(continuous, lap_complete_percent, domain_randomize, bar)
         warm_up()
         self.shows, self.bar, self.continuous = shows, bar, continuous
         self.lap_complete_percent = float(lap_complete_percent)
         self.domain_randomize = domain_randomize
+        self.own_track = None if track is None else make_own_track(track)
         self.cars, self.roads = np.zeros(count, physics.CAR), np.zeros(count, physics.ROAD)
         self.tracks: list[Track | None] = [None] * count
         randoms = [seeding.np_random() for _ in range(count)]
@@ -101,7 +104,7 @@ class Cars:
                 self.randoms[car], self.seeds[car] = seeding.np_random(int(seed))
             if self.domain_randomize and randomize:
                 self._draw_colors(car)
-            track = self.tracks[car] = make_track(self.randoms[car])
+            track = self.tracks[car] = self.own_track or make_track(self.randoms[car])
             share = self.lap_complete_percent
             physics.start_car(self.cars, self.roads, car, track.path, track.tiles, share)
             self._tiles[car, : len(track.tiles)] = track.tiles
@@ -197,6 +200,22 @@ class Cars:
         self.colors["background"][car] = random.uniform(0, 210, size=3)
         self.colors["grass"][car] = self.colors["background"][car]
         self.colors["grass"][car, random.integers(3)] += 20
+
+
+def check_rules(
+    continuous: bool = True,
+    lap_complete_percent: float = 0.95,
+    domain_randomize: bool = False,
+    bar: bool = True,
+) -> None:
+    """Raise ValueError for another share of a lap than 0 to 1, or a switch that is no bool."""
+    switches = {"continuous": continuous, "domain_randomize": domain_randomize, "bar": bar}
+    for name, value in switches.items():
+        if not isinstance(value, bool | np.bool_):
+            raise ValueError(f"{name}={value!r}: expected True or False")
+    number = isinstance(lap_complete_percent, int | float | np.number)
+    if not number or not 0 <= lap_complete_percent <= 1:
+        raise ValueError(f"lap_complete_percent={lap_complete_percent!r}: expected 0 to 1")
 
 
 def pose_on(

@@ -7,7 +7,6 @@ moved it is zero.
 
 from collections import deque
 
-import cv2
 import numpy as np
 
 FRAME_SIZE = 64  # pixels, width and height of a frame
@@ -29,6 +28,8 @@ def to_frame(observation: np.ndarray, crop_bar: bool = True) -> np.ndarray:
             f"observation with dtype {dtype} and shape {shape}: expected uint8 and"
             f" {OBSERVATION_SHAPE}, as CarRacing-v3 gives it without wrappers that change it"
         )
+    import cv2  # here, because our engine draws frames without it
+
     picture = observation[:BAR_TOP] if crop_bar else observation
     return cv2.resize(picture, (FRAME_SIZE, FRAME_SIZE), interpolation=cv2.INTER_AREA)
 

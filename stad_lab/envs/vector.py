@@ -17,8 +17,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from stad_lab.envs import physics
-from stad_lab.envs.car_racing import MAX_FRAMES, spaces
+from stad_lab.envs.car_racing import MAX_FRAMES, action_space, check_skip
 from stad_lab.envs.cars import Cars
+from stad_lab.envs.frames import OBSERVATION_SIZE
+from stad_lab.envs.own_track import Checkpoints
+from stad_lab.envs.views import View
 
 
 class CarRacingVector(gym.vector.VectorEnv):
@@ -26,7 +29,7 @@ class CarRacingVector(gym.vector.VectorEnv):
 
     Args:
         num_envs: number of cars.
-        max_episode_steps: frames after which an episode is truncated.
+        max_episode_steps: steps after which an episode is truncated.
         autoreset_mode: one of Gymnasium's `AutoresetMode`, or its value such as "NextStep".
             NEXT_STEP, the default: the step after an episode's end begins a new one and ignores
             the action. SAME_STEP: the new episode begins at once, and `info` has "final_obs" and
@@ -34,6 +37,7 @@ class CarRacingVector(gym.vector.VectorEnv):
         bar: whether to draw the indicator bar.
         render_mode: None; a batch has no window.
         continuous, lap_complete_percent, domain_randomize: as Gymnasium's.
+        observes, size, frame_skip, track: as of `CarRacing`.
 
     Attributes:
         cars: the engine's `Cars`.
@@ -49,6 +53,10 @@ class CarRacingVector(gym.vector.VectorEnv):
         continuous: bool = True,
         lap_complete_percent: float = 0.95,
         domain_randomize: bool = False,
+        observes: str = "picture",
+        size: int = OBSERVATION_SIZE,
+        frame_skip: int = 1,
+        track: Checkpoints | None = None,
     ):
         if num_envs < 1 or max_episode_steps < 1 or render_mode is not None:
             raise ValueError(
@@ -59,10 +67,12 @@ class CarRacingVector(gym.vector.VectorEnv):
         self.autoreset_mode, self.render_mode = AutoresetMode(autoreset_mode), render_mode
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         rules = (continuous, lap_complete_percent, domain_randomize)
-        self.single_observation_space, self.single_action_space = spaces(continuous)
+        self.view, self.frame_skip = View(observes, size, bar), check_skip(frame_skip)
+        self.single_observation_space = self.view.space
+        self.single_action_space = action_space(continuous)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self.cars = Cars(num_envs, "observation", bar, *rules)
+        self.cars = Cars(num_envs, "observation", bar, *rules, track)
         self._ended = np.ones(num_envs, bool)  # until the first reset
         self._begun = False
 
@@ -94,7 +104,7 @@ class CarRacingVector(gym.vector.VectorEnv):
         which = np.flatnonzero(mask)
         self.cars.reset([seed[car] for car in which], which, options.get("randomize", True))
         self._ended[which], self._begun = False, True
-        return self.cars.draw(), {}
+        return self.view.look(self.cars), {}
 
     def step(
         self, actions: np.ndarray
@@ -118,11 +128,16 @@ class CarRacingVector(gym.vector.VectorEnv):
         driving, rewards = np.flatnonzero(~self._ended), np.zeros(self.num_envs)
         terminated = np.zeros(self.num_envs, bool)
         rewards[driving], terminated[driving] = self.cars.step(actions[driving], driving)
+        for _ in range(self.frame_skip - 1):
+            driving = driving[~terminated[driving]]
+            further, terminated[driving] = self.cars.step(actions[driving], driving)
+            rewards[driving] += further
         self.cars.reset(which=begin)
-        truncated = self.cars.cars["frames"] >= self.max_episode_steps
+        steps = -(-self.cars.cars["frames"] // self.frame_skip)
+        truncated = steps >= self.max_episode_steps
         self._ended = terminated | truncated
         info = self._info(terminated)
-        observations = self.cars.draw()
+        observations = self.view.look(self.cars)
         if self.autoreset_mode == AutoresetMode.SAME_STEP and self._ended.any():
             info = self._begin_again(observations, info)
         return observations, rewards, terminated, truncated, info
@@ -141,6 +156,7 @@ class CarRacingVector(gym.vector.VectorEnv):
 
     def close_extras(self, **kwargs) -> None:
         """Release the memory of the tracks."""
+        self.view.close()
         self.cars = None
 
     def _check_open(self) -> None:
@@ -160,7 +176,7 @@ class CarRacingVector(gym.vector.VectorEnv):
         for car in which:
             final[car] = observations[car].copy()
         self.cars.reset(which=which)
-        observations[which] = self.cars.draw(which)
+        observations[which] = self.view.look(self.cars, which)
         self._ended[:] = False
         return {
             "final_obs": final,

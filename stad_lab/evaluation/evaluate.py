@@ -1,7 +1,7 @@
 """Evaluation: an agent on tracks that neither training nor validation ever touches.
 
 What we report is driven in Gymnasium's own CarRacing-v3 with its own renderer, whole episodes, on
-the tracks 0 to 99. Each track is named by its seed, so that anyone can drive it again.
+`config.REPORTED_TRACKS`. Each track is named by its seed, so that anyone can drive it again.
 """
 
 import time
@@ -13,7 +13,7 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent, load_agent, run_folder
-from stad_lab.config import TRACK_RANGES
+from stad_lab.config import REPORTED_TRACKS, TRACK_RANGES
 from stad_lab.evaluation.statistics import SOLVED, summarise
 from stad_lab.io.files import (
     check_writable,
@@ -25,15 +25,16 @@ from stad_lab.io.files import (
 from stad_lab.io.workers import run_tasks, worker_processes, worker_threads
 from stad_lab.training.evolution import drive_group, hand_out
 from stad_lab.training.pipeline import RUN_FILES
+from stad_lab.training.record import provenance
 
 MOST_EPISODES = 10_000  # a bootstrap of more would need more than 2 GB
-KIND = "evaluation"
+KIND, UNFINISHED = "evaluation", "unfinished evaluation"
 
 
 def evaluate(
     source: str | Path,
-    episodes: int = 100,
-    first_track: int = 0,
+    episodes: int = len(REPORTED_TRACKS),
+    first_track: int = REPORTED_TRACKS.start,
     fast: bool = False,
     processes: int = 2,
     executor: Executor | None = None,
@@ -51,7 +52,8 @@ def evaluate(
 
     Returns:
         A dict for JSON: "variant", "renderer" ("gymnasium" or "fast"), "controller" (checksum of
-        C), what `summarise` computes, "seconds", and "episodes": "track", "return" and "frames".
+        C), what `summarise` computes, "seconds", "made_with" (versions and machine), and
+        "episodes": "track", "return" and "frames".
 
     Raises:
         ValueError: tracks outside the range for tests; and what `load_agent` raises.
@@ -64,7 +66,8 @@ def evaluate(
     # Of V and M as they are loaded: a shipped agent's may be of lower precision.
     weights = {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
     asked = {**identity, "tracks": tracks, **weights}
-    known = load_json(unfinished, "evaluate again") if unfinished and unfinished.exists() else {}
+    there = unfinished and unfinished.exists()
+    known = load_json(unfinished, "evaluate again", kind=UNFINISHED) if there else {}
     driven = known["driven"] if known.get("asked") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]
@@ -78,12 +81,19 @@ def evaluate(
         for number, (returns, lengths) in tqdm(results, f"evaluate ({agent.vae.variant})", **shown):
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
-                now = {"asked": asked, "driven": driven, "seconds": time.perf_counter() - begin}
+                now = {
+                    "kind": UNFINISHED,
+                    "asked": asked,
+                    "driven": driven,
+                    "seconds": time.perf_counter() - begin,
+                }
                 with suppress(OSError):  # with a full disk it goes on, but cannot be resumed
                     save_json(unfinished, now)
     returns, lengths = zip(*(driven[str(track)] for track in tracks), strict=True)
     result = report(tracks, np.array(returns), np.array(lengths))
-    return {"kind": KIND, **identity, **result, "seconds": time.perf_counter() - begin}
+    seconds, command = time.perf_counter() - begin, f"python -m stad_lab evaluate --agent {source}"
+    made_with = provenance(f"{command} --episodes {episodes} --first-track {first_track}")
+    return {"kind": KIND, **identity, **result, "seconds": seconds, "made_with": made_with}
 
 
 def check_tracks(episodes: int, first_track: int) -> None:

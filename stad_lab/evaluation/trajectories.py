@@ -14,21 +14,13 @@ from stad_lab.agent import Agent, Driver, encode_episode, remember_episode, roll
 from stad_lab.config import Config
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import episode_differences, to_frame
-from stad_lab.envs.track import TRACK_WIDTH
+from stad_lab.envs.state import MOTION, true_motion
 from stad_lab.io.weights import WorldModel
 from stad_lab.models.mdn_rnn import Mixture
 from stad_lab.models.vae import VAE, to_array, to_uint8
 from stad_lab.training.dataset import random_start
 
 FRAMES_A_SECOND = 50  # of CarRacing's physics
-MOTION = {  # the columns of `Trajectory.motion`, with their units
-    "forward speed": "world units per second",
-    "slip speed": "world units per second, to the right",
-    "yaw rate": "radians per second, to the left",
-    "wheel angle": "radians, to the left",
-    "road offset": "half road widths, to the right",
-    "heading error": "radians, to the left",
-}
 
 
 @dataclass(frozen=True)
@@ -64,21 +56,6 @@ class Recorder:
             raise ValueError("a trajectory without a frame: drive at least one frame first")
         observations, actions, motion = map(np.array, zip(*self.rows, strict=True))
         return Trajectory(observations, actions, np.array(rewards, np.float32), motion)
-
-
-def true_motion(cars: Cars, car: int = 0) -> np.ndarray:
-    """A car's motion and its place on the road, from the engine: float32 (6,), see MOTION."""
-    state, path = cars.cars[car], cars.tracks[car].path  # of a tile: progress, direction, x, y
-    velocity, angle = state["velocity"][0], float(state["angle"][0])
-    along = -np.sin(angle) * velocity[0] + np.cos(angle) * velocity[1]
-    across = np.cos(angle) * velocity[0] + np.sin(angle) * velocity[1]
-    x, y = state["position"][0]
-    _, direction, tile_x, tile_y = path[np.hypot(path[:, 2] - x, path[:, 3] - y).argmin()]
-    offset = (x - tile_x) * np.cos(direction) + (y - tile_y) * np.sin(direction)
-    turned = (angle - direction + np.pi) % (2 * np.pi) - np.pi
-    wheel = state["angle"][1] - state["angle"][0]
-    motion = [along, across, velocity[2], wheel, offset / TRACK_WIDTH, turned]
-    return np.array(motion, np.float32)
 
 
 def driven_path(motion: np.ndarray) -> np.ndarray:

@@ -85,7 +85,8 @@ def cluster(address: str, patience: float = PATIENCE) -> Iterator[ClusterExecuto
 def check_address(address: str) -> None:
     """Raise ValueError unless it is an address for Client, which hangs if given another."""
     try:
-        get_address_host_port(address)
+        if not 0 < (port := get_address_host_port(address)[1]) < 2**16:
+            raise ValueError(f"there is no port {port}")
         scheme = parse_address(address)[0]
         secure = scheme == "tls" and Security().get_connection_args("client").get("ssl_context")
     except (ValueError, OSError) as error:

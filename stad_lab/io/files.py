@@ -24,6 +24,8 @@ import torch
 from filelock import FileLock, Timeout
 from safetensors.torch import load, save
 
+from stad_lab.io.kinds import SHAPES, find_fault
+
 METADATA = "stad_lab"  # the entry of a safetensors header that holds our metadata
 CHECKSUM = "checksum"
 PATIENCE = 1.0 if os.name == "nt" else 0.0  # seconds that a virus scanner may hold a file
@@ -49,11 +51,24 @@ def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
     try:
         for file in folder.glob(".*.part"):
             ours = re.search(r"\.(\d+)\.[^.]*\.part$", file.name)
-            if ours and not psutil.pid_exists(int(ours[1])):
+            if ours and is_left_over(file, int(ours[1])):
                 file.unlink(missing_ok=True)
         yield
     finally:
         lock.release()
+
+
+def is_left_over(file: Path, process: int) -> bool:
+    """Whether a file was begun by a process that has ended, though another may have its number.
+
+    In a container every run is process 1.
+    """
+    try:
+        return psutil.Process(process).create_time() > file.stat().st_mtime
+    except (psutil.NoSuchProcess, FileNotFoundError):
+        return True
+    except psutil.Error:  # of another user
+        return False
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -170,11 +185,12 @@ def load_json(path: Path, remedy: str = "make it again", kind: str | None = None
 
     Raises:
         OSError: as `read_bytes`.
-        ValueError: the file is damaged, was changed by hand, or names another kind as its own.
+        ValueError: the file is damaged, was changed by hand, names another kind as its own, or
+            lacks what a file of its kind holds.
     """
     content = read_bytes(path, remedy)
     try:
-        value = json.loads(content)
+        value = json.loads(content, object_pairs_hook=without_duplicates)
         wanted = value.pop(CHECKSUM)
     except (ValueError, KeyError, AttributeError, TypeError, RecursionError) as error:
         raise damaged(path, f"{type(error).__name__}: {error}", remedy) from error
@@ -182,6 +198,23 @@ def load_json(path: Path, remedy: str = "make it again", kind: str | None = None
         raise damaged(path, "its content is not that of its checksum", remedy)
     if kind and value.get("kind", kind) != kind:
         raise ValueError(f"{path} is of kind {value['kind']!r}: expected {kind!r}")
+    check_kind(path, value, value.get("kind", kind), remedy)
+    return value
+
+
+def check_kind(path: Path, value: dict, kind: Any, remedy: str) -> None:
+    """Raise ValueError unless the content of a file has the shape of its kind, if that is known."""
+    shape = SHAPES.get(kind) if isinstance(kind, str) else None
+    if shape and (fault := find_fault(value, shape)):
+        raise ValueError(f"{path} is not a file of the kind {kind!r}: {fault}; {remedy}")
+
+
+def without_duplicates(pairs: list[tuple[str, Any]]) -> dict:
+    """The dict of some pairs; ValueError if a key is there twice, since one would be ignored."""
+    value = dict(pairs)
+    if len(value) < len(pairs):
+        keys = [key for key, _ in pairs]
+        raise ValueError(f"{next(key for key in keys if keys.count(key) > 1)!r} is there twice")
     return value
 
 
@@ -234,6 +267,7 @@ def load_tensors(path: Path, remedy: str = "make it again") -> tuple[dict[str, t
     wanted = metadata.pop(CHECKSUM, None)
     if checksum_of_tensors(tensors, json.dumps(metadata)) != wanted:
         raise damaged(path, "its content is not that of its checksum", remedy)
+    check_kind(path, metadata, metadata.get("kind"), remedy)
     return tensors, metadata
 
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from stad_lab.config import Config
+from stad_lab.config import RANGES, Config
 from stad_lab.io.files import checksum_of_tensors, load_into, load_tensors, save_tensors
 from stad_lab.models.controller import check_parameters
 from stad_lab.models.mdn_rnn import MDNRNN
@@ -55,7 +55,7 @@ def load_vae(path: Path) -> tuple[VAE, dict]:
     FileNotFoundError if there is no such file; ValueError if it is damaged, or not V.
     """
     tensors, metadata = load_kind(path, "vae", "variant", "vae", "crop_bar", "weights", "history")
-    vae = VAE(metadata["variant"], metadata["vae"]["latent_size"], metadata["vae"]["width"])
+    vae = VAE.of(config_of(path, metadata))
     load_into(vae.to(memory_format=torch.channels_last), tensors, path)
     return vae.eval().requires_grad_(False), metadata
 
@@ -74,8 +74,8 @@ def save_mdn_rnn(
 def load_mdn_rnn(path: Path) -> tuple[MDNRNN, dict]:
     """Read M: (the MDN-RNN in evaluation mode, its metadata). Raises as `load_vae`."""
     tensors, metadata = load_kind(path, "mdn_rnn", "latent_size", "mdn_rnn", "vae", "weights")
-    sizes = metadata["mdn_rnn"]["hidden_size"], metadata["mdn_rnn"]["mixtures"]
-    mdn_rnn = MDNRNN(metadata["latent_size"], *sizes)
+    sizes = {"vae": {"latent_size": metadata["latent_size"]}, "mdn_rnn": metadata["mdn_rnn"]}
+    mdn_rnn = MDNRNN.of(config_of(path, sizes))
     load_into(mdn_rnn, tensors, path)
     return mdn_rnn.eval().requires_grad_(False), metadata
 
@@ -106,6 +106,16 @@ def load_kind(path: Path, kind: str, *required: str) -> tuple[dict[str, torch.Te
     if missing := [name for name in required if name not in metadata]:
         raise ValueError(f"{path} is not a file of this kind: it lacks {missing[0]!r}; {REMEDY}")
     return tensors, metadata
+
+
+def config_of(path: Path, metadata: dict) -> Config:
+    """The part of a run's configuration that a file names. ValueError if it is not a valid one."""
+    named = {name: metadata[name] for name in ("variant", "vae", "mdn_rnn") if name in metadata}
+    longest = RANGES["data.episode_frames"][1]  # into which every stride and sequence fits
+    try:
+        return Config.from_dict({"data": {"episode_frames": longest}, **named})
+    except ValueError as error:
+        raise ValueError(f"{path} is not a file of this kind: {error}; {REMEDY}") from error
 
 
 def check_belongs(path: Path, metadata: dict, **checksums: str) -> None:

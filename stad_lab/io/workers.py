@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from concurrent import futures
@@ -27,6 +28,7 @@ import stad_lab
 
 PRELOADED = ["stad_lab.training.evolution"]  # a worker's imports take 2 to 4 seconds
 PATIENCE = 3600.0  # seconds without any finished task, after which the workers count as stuck
+LONGEST = 70  # letters of the temporary folder: a socket's name in it has at most 107
 SLICES = 3600  # of the waiting: a suspended machine loses one of them, not all its patience
 
 # Set in a thread whose work nobody waits for any more; `rollout` looks at it in every frame.
@@ -102,8 +104,9 @@ def worker_processes(count: int, given: Executor | None = None) -> Iterator[Exec
         return
     check_script()
     # Not "fork": copies of this process would lack PyTorch's threads.
-    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
-    if sys.platform == "linux":
+    with_server = sys.platform == "linux" and len(tempfile.gettempdir()) <= LONGEST
+    context = multiprocessing.get_context("forkserver" if with_server else "spawn")
+    if with_server:
         context.set_forkserver_preload(PRELOADED)
     count = min(check_count(count), 61) if sys.platform == "win32" else check_count(count)
     others = set(multiprocessing.active_children())

@@ -6,7 +6,7 @@ Models, Ha and Schmidhuber 2018, section 2.2; mixture density networks: Bishop 1
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -56,7 +56,7 @@ class Mixture(NamedTuple):
         flat = weights.reshape(-1, weights.shape[-1])
         choice = torch.multinomial(flat, 1, generator=generator).view(*weights.shape[:-1], 1)
         mean, logsigma = (part.gather(-1, choice)[..., 0] for part in (self.mean, self.logsigma))
-        noise = torch.randn(mean.shape, dtype=mean.dtype, generator=generator)
+        noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
         return mean + logsigma.exp() * math.sqrt(temperature) * noise
 
 
@@ -74,6 +74,12 @@ class MDNRNN(nn.Module):
         self.latent_size, self.hidden_size, self.mixtures = latent_size, hidden_size, mixtures
         self.lstm = nn.LSTM(latent_size + ACTION_SIZE, hidden_size, batch_first=True)
         self.head = nn.Linear(hidden_size, 3 * latent_size * mixtures)  # logpi, mean, logsigma
+
+    @classmethod
+    def of(cls, config: Any) -> "MDNRNN":
+        """The M of a run's `Config`; a setting of the architecture needs no other place."""
+        sizes = config.mdn_rnn.hidden_size, config.mdn_rnn.mixtures
+        return cls(config.vae.latent_size, *sizes)
 
     def forward(
         self, latents: torch.Tensor, actions: torch.Tensor, state: State | None = None

@@ -12,6 +12,8 @@ down to z, four transposed ones up. The paper's figures of its networks are miss
 that we have, so we stack frame and difference as six channels.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import nn
@@ -64,6 +66,11 @@ class VAE(nn.Module):
             nn.ReLU(inplace=True),
             ColourDeconvolution(width, 6 if self.reconstructs_difference else 3, 6, stride=2),  # 64
         )
+
+    @classmethod
+    def of(cls, config: Any) -> "VAE":
+        """The V of a run's `Config`; a setting of the architecture needs no other place."""
+        return cls(config.variant, config.vae.latent_size, config.vae.width)
 
     def encode(
         self, frame: torch.Tensor, difference: torch.Tensor

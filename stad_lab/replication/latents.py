@@ -137,17 +137,17 @@ def shipped(prefix: str = "cropped_") -> Iterator[tuple[str, WorldModel]]:
 
 def probe_part(study: Study) -> dict:
     """Probe the latents of every variant, of untrained V, and of every stride: two drivers."""
-    config, (v, m) = study.config, (study.config.vae, study.config.mdn_rnn)
+    config, names = study.config, ("frame", "input_output")
     with torch_settings(config.seed, 0):
-        untrained = {name: VAE(name, v.latent_size, v.width) for name in ("frame", "input_output")}
-        mdn_rnn = MDNRNN(v.latent_size, m.hidden_size, m.mixtures)
+        untrained = {name: VAE.of(config.replace(variant=name)) for name in names}
+        mdn_rnn = MDNRNN.of(config)
     encoders = {}
     for prefix in ("cropped_", ""):
         for variant, model in shipped(prefix):
             memories = {"z, h": model.mdn_rnn, "z, h of an untrained M": mdn_rnn}
             encoders[f"{prefix}{variant}"] = encoder_of(model, memories)
     for name, vae in untrained.items():
-        encoders[f"{name}, untrained"] = Encoder(vae, v.stride, config.data.crop_bar, {})
+        encoders[f"{name}, untrained"] = Encoder(vae, config.vae.stride, config.data.crop_bar, {})
     for stride in STRIDES:
         encoders[f"stride {stride}"] = shorter_encoder(study, stride=stride)
     found = {

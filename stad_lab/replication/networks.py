@@ -22,6 +22,7 @@ from stad_lab.io.files import load_into, save_tensors
 from stad_lab.io.weights import (
     WorldModel,
     check_belongs,
+    config_of,
     load_controller,
     load_kind,
     load_world_model,
@@ -56,16 +57,15 @@ def load_kept_world_model(path: Path) -> WorldModel:
     FileNotFoundError if there is no such file; ValueError if it is damaged, or of another kind.
     """
     tensors, metadata = load_kind(path, KIND, "variant", "vae", "mdn_rnn", "crop_bar", "trained")
-    v, m = metadata["vae"], metadata["mdn_rnn"]
-    vae = VAE(metadata["variant"], v["latent_size"], v["width"])
-    mdn_rnn = MDNRNN(v["latent_size"], m["hidden_size"], m["mixtures"])
+    config = config_of(path, metadata)
+    vae, mdn_rnn = VAE.of(config), MDNRNN.of(config)
     del vae.decoder, mdn_rnn.head
     vae = vae.to(memory_format=torch.channels_last)
     for name, network in (("vae.", vae), ("mdn_rnn.", mdn_rnn)):
         own = {key.removeprefix(name): one for key, one in tensors.items() if key.startswith(name)}
         load_into(network, own, path)
         network.eval().requires_grad_(False)
-    return WorldModel(vae, mdn_rnn, v["stride"], metadata["crop_bar"], metadata["trained"])
+    return WorldModel(vae, mdn_rnn, config.vae.stride, metadata["crop_bar"], metadata["trained"])
 
 
 def keep_controller(path: Path, parameters: np.ndarray, variant: str, trained: dict) -> None:
@@ -83,4 +83,6 @@ def load_kept_agent(path: Path) -> Agent:
 
 def how_to_get(study: str) -> str:
     """What to do about kept agents that are not there, for a message."""
+    if not NETWORKS.is_dir():
+        return "clone the repository of stad_lab, what pip installs does not hold them"
     return f"make them with `python -m stad_lab replicate {study}`"

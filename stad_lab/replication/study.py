@@ -26,7 +26,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from stad_lab.agent import Agent
-from stad_lab.config import VARIANTS, Config
+from stad_lab.config import STUDY_TRACKS, VARIANTS, Config
 from stad_lab.evaluation.evaluate import report
 from stad_lab.io.files import (
     checksum,
@@ -72,7 +72,7 @@ class Study:
     variants: tuple[str, ...] = VARIANTS
     features: tuple[str, ...] = ("z", "z, h")  # what C sees
     config: Config = field(default_factory=lambda: Config.preset("laptop"))
-    tracks: range = range(1000, 1400)
+    tracks: range = STUDY_TRACKS
     max_frames: int = 1000  # of an episode of the score, which has no patience
 
 

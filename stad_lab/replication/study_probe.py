@@ -107,11 +107,9 @@ def kept_world_models(study: str, seed: int, to: Path, networks: Path) -> dict[s
 def untrained(study: str, variant: str, seed: int) -> Encoder:
     """V and M of a study's sizes with random weights, which depend on the seed."""
     config = STUDIES[study].config
-    v, m = config.vae, config.mdn_rnn
     with torch_settings(seed, 0):
-        vae = VAE(variant, v.latent_size, v.width)
-        mdn_rnn = MDNRNN(v.latent_size, m.hidden_size, m.mixtures)
-    return Encoder(vae, v.stride, config.data.crop_bar, {"z, h": mdn_rnn})
+        vae, mdn_rnn = VAE.of(config.replace(variant=variant)), MDNRNN.of(config)
+    return Encoder(vae, config.vae.stride, config.data.crop_bar, {"z, h": mdn_rnn})
 
 
 def lines_of(found: dict) -> list[dict]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas
 
-from stad_lab.config import flatten
+from stad_lab.config import REPORTED_TRACKS, flatten
 from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.io.files import checksum_of_tensors, load_json, load_tensors, write_bytes
 from stad_lab.replication.experiments import BASELINE_DRIVERS, EXPERIMENTS
@@ -22,7 +22,7 @@ from stad_lab.training.evolution import fitness_curves
 from stad_lab.training.record import total_budget
 
 DATA = Path(__file__).parent / "data"
-TRACKS = 100  # each run is evaluated on the tracks 0 to 99, with Gymnasium's renderer
+TRACKS = len(REPORTED_TRACKS)  # of each run, with Gymnasium's renderer
 UNITS = ("agents", "episodes", "frames")
 RUN = ["experiment", "role", "seed"]
 PIPELINE = ["study", "variant", "features", "seed"]

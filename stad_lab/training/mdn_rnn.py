@@ -73,8 +73,7 @@ def mdn_rnn_depends_on(config: Config) -> dict:
 
 def fit_mdn_rnn(config: Config, latents: Latents, path: Path, device: torch.device) -> None:
     """Train an M on encoded episodes and write it to `path`."""
-    sizes = config.vae.latent_size, config.mdn_rnn.hidden_size, config.mdn_rnn.mixtures
-    mdn_rnn = MDNRNN(*sizes).to(device)
+    mdn_rnn = MDNRNN.of(config).to(device)
     training = mdn_rnn_training(config, latents, mdn_rnn, path.with_name(CHECKPOINT))
     history = fit(training)
     weights.save_mdn_rnn(path, mdn_rnn, config, history, latents.vae)

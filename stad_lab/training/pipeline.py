@@ -21,9 +21,12 @@ import torch
 
 from stad_lab.agent import PRETRAINED
 from stad_lab.config import Config
+from stad_lab.inference import Inference
 from stad_lab.io.files import copy_file, load_json, load_tensors, locked, save_json, save_tensors
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_vae, load_world_model
 from stad_lab.io.workers import worker_threads
+from stad_lab.models.mdn_rnn import MDNRNN
+from stad_lab.models.vae import VAE
 from stad_lab.training import second_iteration
 from stad_lab.training.dataset import (
     MANIFEST,
@@ -125,8 +128,13 @@ def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) 
 
 
 def check_stages(config: Config, folder: Path, data: Path) -> None:
-    """Raise ValueError, before any work, if a finished stage in the folder is of another run."""
+    """Raise ValueError, before any work, if a finished stage in the folder is of another run.
+
+    Or if V and M of this configuration could be trained, but not drive.
+    """
     check_record(folder)
+    with torch.random.fork_rng([]):
+        Inference(VAE.of(config), MDNRNN.of(config))
     if not config.data.agent_episodes:
         read_manifest(data, made_with(config))
     if (folder / VAE_FILE).exists():

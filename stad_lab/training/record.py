@@ -49,8 +49,8 @@ def read_finished(earlier: Path) -> dict:
     ValueError if it has not, or a file is damaged; FileNotFoundError if there is no run, or no log.
     """
     check_record(earlier)
-    record = load_json(earlier / RECORD, GIVE_A_RUN)
-    log = load_json(earlier / LOG, GIVE_A_RUN)
+    record = load_json(earlier / RECORD, GIVE_A_RUN, kind="record")
+    log = load_json(earlier / LOG, GIVE_A_RUN, kind="evolution")
     done, asked = len(log["generations"]), log["evolution"]["generations"]
     if done != asked:
         found = f"with {done} of {asked} generations: run its own command to the end first"
@@ -194,11 +194,11 @@ def budget(config: Config, folder: Path, data: Path | None) -> dict:
     count = config.data.episodes
     again = config.data.agent_episodes > 0
     order = second_iteration.order_of_episodes(config) if again else range(count)
-    for entry in load_json(data / MANIFEST)["episodes"] if data else ():
+    for entry in load_json(data / MANIFEST, kind="dataset")["episodes"] if data else ():
         driver = "random" if order[entry["index"]] < count else "agent_driver"
         spent[driver].update(episodes=1, frames=entry["frames"])
     if (folder / LOG).exists():
-        generations = load_json(folder / LOG)["generations"]
+        generations = load_json(folder / LOG, kind="evolution")["generations"]
         spent["agents"] = sum(len(entry["returns"]) for entry in generations)
         for entry in generations:
             episodes = sum(map(len, entry["returns"]))

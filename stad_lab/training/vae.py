@@ -45,7 +45,7 @@ def train_vae(
         return False
     data = dataset()
     with locked(path.parent), torch_settings(config.seed, 0) as device:
-        vae = VAE(config.variant, config.vae.latent_size, config.vae.width)
+        vae = VAE.of(config)
         vae.to(device, memory_format=torch.channels_last)
         training = vae_training(config, data, vae, path.with_name(CHECKPOINT))
         training.watch = watch

@@ -202,6 +202,13 @@ def test_an_action_that_is_not_three_finite_numbers_is_refused(action):
         env.unwrapped.step(np.array(action))
 
 
+@pytest.mark.parametrize("fast", [True, False])
+@pytest.mark.parametrize("name", ["continuous", "domain_randomize"])
+def test_a_switch_that_is_no_bool_is_refused(name, fast):
+    with pytest.raises(ValueError, match=f"{name}='no': expected True or False"):
+        make_env(fast=fast, **{name: "no"})
+
+
 @pytest.mark.parametrize("share", [95, -0.1, np.nan])
 def test_a_share_of_a_lap_that_is_none_is_refused(share):
     with pytest.raises(ValueError, match=f"lap_complete_percent={share}: expected 0 to 1"):

@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from stad_lab.agent import PRETRAINED, Agent
@@ -226,7 +227,7 @@ def test_one_car_dreams_with_its_own_c_and_several_cannot(agent, observations):
 def test_gymnasium_makes_the_dream_of_an_agent_by_its_name_in_a_fresh_process():
     code = """
 import gymnasium, numpy as np
-env = gymnasium.make("stad_lab:StadLab/Dream-v0", source="frame", render_mode="rgb_array")
+env = gymnasium.make("stad_lab:StadLab/Dream-v0", agent="frame", render_mode="rgb_array")
 env.reset(seed=0)
 env.step(np.zeros(3, np.float32))
 print(env.render().shape, env.unwrapped.vae.variant)
@@ -236,8 +237,54 @@ print(env.render().shape, env.unwrapped.vae.variant)
 
 
 def test_a_dream_is_made_of_a_name_or_a_folder():
-    env = gym.make("StadLab/Dream-v0", source=PRETRAINED / "input", max_frames=3)
+    env = gym.make("StadLab/Dream-v0", agent=PRETRAINED / "input", max_frames=3)
     assert env.unwrapped.vae.variant == "input" and env.unwrapped.max_frames == 3
     assert make_dream("output").vae.variant == "output"
     with pytest.raises(FileNotFoundError):
         make_dream("no_such_run")
+
+
+def make_dreams(**options):
+    """Three dreams of a shipped agent at once."""
+    how = {"num_envs": 3, "vectorization_mode": "vector_entry_point", "agent": "frame"}
+    return gym.make_vec("stad_lab:StadLab/Dream-v0", **how, **options)
+
+
+def test_many_dreams_at_once_are_those_of_single_environments():
+    envs = make_dreams(temperature=0.7, max_frames=5, render_mode="rgb_array")
+    single = [make_dream("frame", 0.7, max_frames=5, render_mode="rgb_array") for _ in range(3)]
+    found, info = envs.reset(seed=4)
+    expected = [env.reset(seed=4 + number) for number, env in enumerate(single)]
+    rng = np.random.default_rng(0)
+    for step in range(14):
+        assert np.allclose(found, [one[0] for one in expected], atol=1e-4)
+        assert np.allclose(info["hidden"], [one[-1]["hidden"] for one in expected], atol=1e-4)
+        actions = rng.uniform(0, 1, (3, 3)).astype(np.float32)
+        found, rewards, terminated, truncated, info = envs.step(actions)
+        if step % 6 == 5:  # the step after an end begins anew
+            expected = [env.reset() for env in single]
+        else:
+            expected = [env.step(action) for env, action in zip(single, actions, strict=True)]
+        assert truncated.all() == (step % 6 == 4) and not terminated.any() and not rewards.any()
+    pictures = [env.render().astype(int) for env in single]
+    assert np.abs(np.array(envs.render()) - pictures).max() <= 1
+
+
+def test_dreams_that_are_not_begun_closed_or_given_nonsense_say_so():
+    envs = make_dreams(max_frames=1, autoreset_mode="Disabled")
+    with pytest.raises(ResetNeeded):
+        envs.step(np.zeros((3, 3)))
+    envs.reset(seed=0)
+    for actions in (np.zeros((2, 3)), np.full((3, 3), np.nan)):
+        with pytest.raises(ValueError, match="expected finite numbers of shape"):
+            envs.step(actions)
+    envs.step(np.zeros((3, 3)))
+    with pytest.raises(RuntimeError, match="have ended: call reset"):
+        envs.step(np.zeros((3, 3)))
+    envs.reset(options={"reset_mask": np.array([True, True, True])})
+    envs.close()
+    with pytest.raises(ClosedEnvironmentError):
+        envs.reset()
+    for options in ({"autoreset_mode": "SameStep"}, {"temperature": 0}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            make_dreams(**options)

@@ -196,7 +196,15 @@ def test_an_address_without_a_scheduler_is_an_error_with_its_remedy():
 
 
 @pytest.mark.parametrize(
-    "address", ["127.0.0.1", "nonsense", "http://127.0.0.1:8787/status", "tls://127.0.0.1:9"]
+    "address",
+    [
+        "127.0.0.1",
+        "nonsense",
+        "http://127.0.0.1:8787/status",
+        "tls://127.0.0.1:9",
+        "tcp://127.0.0.1:0",
+        "tcp://127.0.0.1:99999",
+    ],
 )
 def test_what_is_no_address_is_refused_before_a_client_is_made(address, monkeypatch):
     monkeypatch.setattr("stad_lab.io.dask_cluster.Client", None)

@@ -1,7 +1,9 @@
 """Damaged files, killed processes, full disks: nothing is lost, and nothing damaged is used."""
 
 import contextlib
+import copy
 import errno
+import functools
 import os
 import random
 import re
@@ -14,6 +16,7 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
@@ -21,6 +24,7 @@ from stad_lab.agent import load_agent
 from stad_lab.cli import main
 from stad_lab.config import Config
 from stad_lab.evaluation.evaluate import evaluate
+from stad_lab.evaluation.statistics import summarise
 from stad_lab.evaluation.verify import verify, verify_dataset
 from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors, write_bytes
 from stad_lab.io.workers import TaskError
@@ -372,11 +376,41 @@ def test_half_written_files_of_a_killed_process_are_removed_and_those_of_others_
     ended = subprocess.Popen([sys.executable, "-c", ""])
     ended.wait()
     left_over = folder / f".evolution.json.{ended.pid}.abc.part"
+    another_run = folder / ".evolution.json.1.abc.part"  # of a container, whose first process is 1
     others = [folder / ".thesis.zip.part", folder / f".log.{os.getppid()}.abc.part"]
-    for file in (left_over, *others):
+    for file in (left_over, another_run, *others):
         file.write_bytes(b"{")
+    os.utime(another_run, (0, 0))
     evolve(QUICK, folder, in_this_process)
-    assert not left_over.exists() and all(file.exists() for file in others)
+    assert not left_over.exists() and not another_run.exists()
+    assert all(file.exists() for file in others)
+
+
+def test_a_key_that_is_there_twice_is_a_damage(tmp_path):
+    file = tmp_path / "file.json"
+    save_json(file, {"mean": 900})
+    file.write_text(file.read_text().replace('"mean"', '"mean": 900, "mean"', 1))
+    with pytest.raises(ValueError, match="'mean' is there twice"):
+        load_json(file)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell with sh's redirections")
+@pytest.mark.parametrize("redirection", [">&- 2>&-", "2>&1 | head -1"])
+def test_a_training_outlives_the_readers_of_its_output(redirection, quick_run, tmp_path):
+    folder = start_of("controller", quick_run, tmp_path / "run")
+    arguments = f"train quick --variant input_output --out {folder}"
+    command = f"{sys.executable} -m stad_lab {arguments} {redirection}"
+    subprocess.run(command, shell=True, timeout=120, capture_output="head" in redirection)
+    assert_equal_results(folder, quick_run, "controller")
+
+
+def test_a_file_is_never_written_through_a_link(tmp_path):
+    """A temporary name cannot be guessed, and a link in its place is not followed."""
+    (tmp_path / "secret").write_text("kept")
+    (tmp_path / "file.json").symlink_to(tmp_path / "secret")
+    save_json(tmp_path / "file.json", {})
+    assert (tmp_path / "secret").read_text() == "kept"
+    assert not (tmp_path / "file.json").is_symlink()
 
 
 def test_an_environment_that_raises_stops_the_run_with_its_cause_and_the_run_continues_later(
@@ -567,7 +601,49 @@ def test_verify_finds_a_return_that_no_episode_gives(quick_run, tmp_path, in_thi
     elsewhere = record["made_with"] | {"processor": "another processor"}
     save_json(folder / "record.json", record | {"continued_with": [elsewhere]})
     episodes = verify(folder, in_this_process)["episodes"]
-    assert re.match(r"differs: .*; but processor is '.*' and was 'another processor'", episodes)
+    assert re.match(r"differs: .*; processor is '.*' and was 'another processor'", episodes)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "points", "expected"),
+    [
+        ({}, 0.001, "FAILED"),
+        ({"numba": None}, 0.001, "differs: .*; unknown, because not recorded: numba$"),
+        ({"numba": None}, 60, "FAILED"),
+        ({"processor": "another"}, 29, "differs: .*; processor is '.*' and was 'another'$"),
+        ({"processor": "another"}, 60, "FAILED.*: rounding alone does not explain it"),
+    ],
+)
+def test_verify_tolerates_a_bounded_difference_and_only_from_another_or_an_unknown_machine(
+    recorded, points, expected, whole, tmp_path, in_this_process
+):
+    folder = shutil.copytree(whole, tmp_path / "run", ignore=WITHOUT_DATASET)
+    result = load_json(folder / "evaluation.json")
+    made_with = result["made_with"] | recorded
+    known = {name: value for name, value in made_with.items() if value is not None}
+    for episode in result["episodes"]:
+        episode["return"] += points
+    summary = summarise(np.array([episode["return"] for episode in result["episodes"]]))
+    save_json(folder / "evaluation.json", result | summary | {"made_with": known})
+    assert re.match(expected, verify(folder, in_this_process)["episodes"])
+
+
+def test_verify_tolerates_rounding_in_a_replayed_log_and_nothing_more(
+    quick_run, tmp_path, in_this_process
+):
+    folder = shutil.copytree(quick_run, tmp_path / "run", ignore=WITHOUT_DATASET)
+    record, log = (load_json(folder / name) for name in ("record.json", "evolution.json"))
+    elsewhere = record["made_with"] | {"processor": "another"}
+    save_json(folder / "record.json", record | {"made_with": elsewhere})
+    first = log["generations"][0]
+    first["mean_checksum"] += 1  # as if its last bits had been others
+    save_json(folder / "evolution.json", log)
+    found = verify(folder, in_this_process)["log of CMA-ES"]
+    assert found.startswith("differs: replaying the log gives another mean in generation 1")
+    first["returns"] = first["returns"][::-1]
+    save_json(folder / "evolution.json", log)
+    found = verify(folder, in_this_process)["log of CMA-ES"]
+    assert found.startswith("FAILED: replaying the log gives another mean in generation 1")
 
 
 def test_verify_drives_the_episodes_of_an_evaluation_again(whole, tmp_path, in_this_process):
@@ -735,3 +811,66 @@ def test_a_full_training_reads_and_hashes_each_file_of_the_dataset_once(
     assert train(config, run, executor=in_this_process)
     files = {path.name for path in (run / "dataset").glob("*.npy")}
     assert set(counted) == files and set(counted.values()) == {1}
+
+
+# Files with a right checksum and a wrong content
+
+
+def places(value, place=()):
+    """Every place in a nested value, of a list the first element."""
+    if place:
+        yield place
+    pairs = value.items() if isinstance(value, dict) else enumerate(value[:1])
+    for key, part in pairs if isinstance(value, dict | list) else ():
+        yield from places(part, (*place, key)) if isinstance(part, dict | list) else [(*place, key)]
+
+
+def changed(value, place, new):
+    """A copy of a nested value with another part, or without it if `new` is None."""
+    whole = copy.deepcopy(value)
+    part = functools.reduce(lambda one, key: one[key], place[:-1], whole)
+    if new is None:
+        del part[place[-1]]
+    else:
+        part[place[-1]] = new
+    return whole
+
+
+@pytest.mark.parametrize("name", ["record.json", "evolution.json", "dataset/manifest.json"])
+def test_a_file_with_a_right_checksum_and_a_wrong_content_is_refused_in_one_line(
+    name, quick_run, tmp_path, in_this_process
+):
+    run = shutil.copytree(quick_run, tmp_path / "run")
+    value, rng, refused = load_json(run / name), random.Random(name), 0
+    for place in rng.sample(list(places(value)), 8):
+        save_json(run / name, changed(value, place, rng.choice([None, "x", [], {}, -1])))
+        found = "; ".join(failures_of(lambda: verify(run, in_this_process)))
+        assert not re.search("object|subscript|FAILED: '|expected str", found), (place, found)
+        refused += bool(found)
+    assert refused >= 2
+
+
+def failures_of(check):
+    """What a check of a run refuses: the ValueError's message, or what it says FAILED."""
+    try:
+        return [text for text in check().values() if text.startswith("FAILED")]
+    except ValueError as error:
+        return [str(error)]
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "new", "fault"),
+    [
+        ("evaluation", ("episodes", 0, "return"), "x", "episodes[0].return is not of type float"),
+        ("evaluation", ("episodes", 0, "track"), None, "it lacks episodes[0].track"),
+        ("evolution", ("best",), 3, "best is not of type dict"),
+        ("record", ("made_with",), [], "made_with is not of type dict"),
+    ],
+)
+def test_what_a_file_lacks_is_named(kind, place, new, fault, whole, tmp_path):
+    names = {"evaluation": "evaluation.json", "evolution": "evolution.json"}
+    value = load_json(whole / names.get(kind, "record.json"))
+    save_json(tmp_path / "file.json", changed(value, place, new))
+    with pytest.raises(ValueError, match="is not a file of the kind") as caught:
+        load_json(tmp_path / "file.json", "make it again")
+    assert str(caught.value).endswith(f"{kind!r}: {fault}; make it again")

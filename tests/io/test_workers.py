@@ -180,6 +180,14 @@ def test_a_worker_that_loaded_another_stad_lab_is_refused(tmp_path):
     assert process.stderr.splitlines()[-1].startswith(f"ValueError: {message}"), process.stderr
 
 
+def test_workers_start_though_the_temporary_folder_has_a_long_name(tmp_path):
+    folder = tmp_path / "a folder with a long name".ljust(80, "g")
+    folder.mkdir()
+    text = ORPHAN.replace("time.sleep(1000)", "pass")
+    process = run_script(tmp_path, text, TMPDIR=str(folder))
+    assert process.returncode == 0 and process.stdout.strip().isdigit(), process.stderr
+
+
 SUSPENDED = """
 import time
 from stad_lab.io.workers import PRELOADED, run_tasks, worker_processes

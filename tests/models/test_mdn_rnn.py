@@ -87,6 +87,7 @@ def test_predictions_and_losses_stay_on_one_device():
     mixture, state = mdn_rnn(latents, actions)
     mdn_loss(mixture, latents).backward()
     _, state = mdn_rnn.remember(latents[:, :1], actions[:, :1], state)
+    assert mixture.sample().device.type == "meta"
     gradients = [parameter.grad for parameter in mdn_rnn.parameters()]
     assert {part.device.type for part in (*mixture, *state, *gradients)} == {"meta"}
 

@@ -13,7 +13,7 @@ from stad_lab.config import TRACK_RANGES, Config, track_seeds
 from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.io.files import load_json, load_tensors
 from stad_lab.io.weights import CONTROLLER_FILE, VAE_FILE, load_controller
-from stad_lab.replication import latents, study, study_probe, tables
+from stad_lab.replication import latents, networks, study, study_probe, tables
 from stad_lab.replication.networks import WORLD_MODEL_FILE, load_kept_agent
 from stad_lab.replication.study import (
     SCORE,
@@ -266,3 +266,9 @@ def test_a_variant_that_another_process_runs_is_left_to_it(made, tmp_path, capsy
         other.stdin.close()
     assert "seed0/frame: is run by another process" in capsys.readouterr().out
     assert set(tables.read_study("runs", tmp_path / "data").variant) == {"input_output"}
+
+
+def test_without_the_kept_agents_an_installed_library_names_the_repository(tmp_path, monkeypatch):
+    monkeypatch.setattr(networks, "NETWORKS", tmp_path / "networks")
+    with pytest.raises(FileNotFoundError, match="clone the repository"):
+        list(study.evaluate_kept("study1", [0], networks=tmp_path / "networks"))

@@ -1,0 +1,59 @@
+"""Output that may be gone: a training does not end because nobody reads what it prints."""
+
+import os
+import sys
+from typing import TextIO
+
+
+def open_missing_streams() -> None:
+    """Give a process the standard streams that it was started without, as with `2>&-`.
+
+    They lead nowhere. Otherwise the next file that is opened would take the place of one, and get
+    what a library prints.
+    """
+    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115
+
+
+class Lasting:
+    """A text stream that leads nowhere from the first write on that fails.
+
+    The terminal was closed, or the reader of a pipe has ended, as `| head -1` does.
+    """
+
+    def __init__(self, stream: TextIO):
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        """As for every stream; what was not printed yet is lost."""
+        try:
+            return self.stream.write(text)
+        except OSError:
+            self.lead_nowhere()
+            return len(text)
+
+    def flush(self) -> None:
+        """As for every stream."""
+        try:
+            self.stream.flush()
+        except OSError:
+            self.lead_nowhere()
+
+    def lead_nowhere(self) -> None:
+        """Replace the file below the stream, so that the last flush succeeds, too."""
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, self.stream.fileno())
+        os.close(nowhere)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.stream, name)
+
+
+def make_streams_last() -> None:
+    """Let this process outlive the readers of its output."""
+    sys.stdout, sys.stderr = Lasting(sys.stdout), Lasting(sys.stderr)
