@@ -345,3 +345,26 @@ def test_ci_runs_the_one_test_command_of_the_readme():
     assert names == ["jupyter", "pytest"]
     script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
     assert "grep -m 1 '^python3 .*pytest' README.md" in script
+
+
+def test_the_package_says_that_it_has_types_and_under_which_licences_it_is():
+    assert (ROOT / "stad_lab" / "py.typed").exists()
+    assert "py.typed" in PYPROJECT["tool"]["setuptools"]["package-data"]["stad_lab"]
+    files = PYPROJECT["project"]["license-files"]
+    texts = [(ROOT / name).read_text(encoding="utf-8") for name in files]
+    assert "MIT License" in texts[0] and "CC BY 4.0" in texts[1]
+
+
+def test_the_changelog_begins_with_what_is_not_released_and_knows_the_present_version():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    versions = re.findall(r"^## (\S+)", text, re.MULTILINE)
+    assert versions[:2] == ["Unreleased", PYPROJECT["project"]["version"]]
+
+
+@pytest.mark.parametrize(
+    "file", sorted([*(ROOT / ".github").rglob("*.yml"), ROOT / ".pre-commit-config.yaml"])
+)
+def test_every_file_that_a_code_host_reads_is_valid_yaml(file):
+    yaml = pytest.importorskip("yaml")  # which JupyterLab and Sphinx bring
+    found = yaml.safe_load(file.read_text(encoding="utf-8"))
+    assert {*found} & {"jobs", "body", "repos", "blank_issues_enabled"}
