@@ -32,7 +32,7 @@ SHAPES: dict[str, Any] = {
         "variant": str,
         "seed": int,
         "evolution": {"generations": int},
-        "random": {"entropy": int, "spawn_key": [int]},
+        "random": {"entropy": (int, [int]), "spawn_key": [int]},
         "best": (type(None), {"generation": int, "validation": (int, float)}),
         "generations": [GENERATION],
     },

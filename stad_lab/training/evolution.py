@@ -38,13 +38,13 @@ Watch = Callable[[list[dict]], None]
 
 
 class Drives(Protocol):
-    """What drives in place of V, M and C of a world model, for example with another view of z."""
+    """What drives in place of a world model, for example with another view of z."""
 
     sizes: tuple[int, int]  # how many numbers z has, and how many C sees beside it
     checksums: dict[str, str]  # what a log and a controller must belong to
 
     def drive(self, parameters: np.ndarray, tracks: list[int], **limits) -> Episodes:
-        """Drive one episode on each track with a row of `parameters` for each."""
+        """As `stad_lab.agent.drive`."""
 
 
 @dataclasses.dataclass
@@ -65,12 +65,9 @@ class Evolution:
 
 
 def evolve(
-    config: Config,
-    folder: Path,
-    executor: Executor | None = None,
-    watch: Watch | None = None,
+    config: Config, folder: Path, executor: Executor | None = None, watch: Watch | None = None,
     drives: Drives | None = None,
-) -> bool:
+) -> bool:  # fmt: skip
     """Evolve C for the V and M in `folder`; False if the run was complete already.
 
     All agents of a generation drive the same tracks; their fitness is their mean return. Every few
