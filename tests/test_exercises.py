@@ -193,6 +193,23 @@ def test_every_cell_of_the_solution_runs(graded):
     assert all(re.search('alt="[^"]{20,}"', "".join(picture)) for picture in pictures)
 
 
+@pytest.mark.parametrize("graded", GRADED, indirect=True)
+def test_an_open_exercise_ends_in_a_panel_and_not_in_a_traceback(graded):
+    root, name = graded
+    cells = read_cells(root / "autograded" / "stub" / name / f"{name}.ipynb")
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    panels = [output["traceback"] for output in outputs if output["output_type"] == "error"]
+    assert len(panels) >= 5 and all(len(panel) == 2 for panel in panels[:3])
+    assert all("Not done yet" in panel[0] for panel in panels[:3])
+
+
+def test_the_notebooks_do_not_show_what_their_checks_look_for():
+    for path in NOTEBOOKS:
+        checks = [cell for cell in read_cells(path) if grading(cell)["grade"]]
+        sources = [cell["source"] for cell in checks if not grading(cell)["solution"]]
+        assert sources and all(source.startswith("checks.") for source in sources)
+
+
 def test_the_student_versions_are_what_one_command_makes_of_the_sources(generator, tmp_path):
     made = generator.generate(tmp_path)
     assert [path.stem for path in made] == NAMES
