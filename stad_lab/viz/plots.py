@@ -162,11 +162,9 @@ def plot_road(
         reach: how far that panel extends to each side, world units.
     """
     figure, axes = new_figure(8.6, 4.3, 1, 2)
-    along = np.roll(road, -1, axis=0) - np.roll(road, 1, axis=0)
-    across = TRACK_WIDTH * along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1, keepdims=True)
-    edges = [np.concatenate([edge, edge[:1]]) for edge in (road + across, road - across)]
+    left, right = road_edges(road)
     for axis in axes[0]:
-        axis.fill(*np.concatenate([edges[0], edges[1][::-1]]).T, color="0.85", label="road")
+        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85", label="road")
         for (name, path), (color, dash) in zip(paths.items(), STYLES, strict=False):
             axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
             axis.plot(*path[-1], "x", color=color, ms=7)
@@ -537,3 +535,69 @@ def plot_intervals(
             axes[0, 0].plot([], [], mark, color=color, label=name)
         legend_below(figure, axes[0, 0])
     return describe(figure, title, "; ".join(values))
+
+
+# Candidates on the map
+
+
+def road_edges(road: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both edges of a lap, closed: centres of its tiles (tiles, 2) -> (tiles + 1, 2) each."""
+    along = np.roll(road, -1, axis=0) - np.roll(road, 1, axis=0)
+    across = TRACK_WIDTH * along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1, keepdims=True)
+    left, right = (np.concatenate([edge, edge[:1]]) for edge in (road + across, road - across))
+    return left, right
+
+
+def draw_map(axis: Axes, road: np.ndarray, paths: list[np.ndarray], returns: np.ndarray) -> None:
+    """A lap from above with the path of each car: the best in ORANGE, the others in BLUE."""
+    left, right = road_edges(road)
+    axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.87")
+    best = int(np.argmax(returns))
+    for place, path in enumerate(paths):
+        if place != best:
+            axis.plot(*path.T, color=BLUE, lw=1.0, alpha=0.6)
+            axis.plot(*path[-1], ".", color=BLUE, ms=5)
+    axis.plot(*paths[best].T, color=ORANGE, lw=2.2)
+    axis.plot(*paths[best][-1], ".", color=ORANGE, ms=9)
+    axis.plot(*road[0], "^", color="black", ms=7)
+    low, high = road.min(axis=0) - 35, road.max(axis=0) + 35  # a car may end far in the grass
+    axis.set(xticks=[], yticks=[], aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axis.spines[:].set_visible(False)
+
+
+def plot_maps(maps: dict[str, tuple], title: str) -> Figure:
+    """Laps from above: name -> (road (tiles, 2), paths of cars (T, 2) each, returns (cars,))."""
+    rows = -(-len(maps) // 5)
+    columns = -(-len(maps) // rows)
+    figure, axes = new_figure(min(2.6 * columns, 10.5) + 0.2, 2.9 * rows + 0.4, rows, columns)
+    for axis, (name, (road, paths, returns)) in zip(axes.flat, maps.items(), strict=False):
+        draw_map(axis, road, paths, returns)
+        caption(axis, f"{name}: best {returns.max():.0f}" if len(returns) > 1 else name)
+    for axis in axes.flat[len(maps) :]:
+        axis.set_visible(False)
+    bests = [f"{name}, best return {own[2].max():.0f}" for name, own in maps.items()]
+    return describe(figure, title, "Laps from above (triangle: start, dot: end). ", bests)
+
+
+def plot_learning(generations: list[dict], total: int, title: str) -> Figure:
+    """The last generation on its map, beside the returns of all so far.
+
+    Args:
+        generations: each {"road", "paths", "returns"} as `plot_maps` takes them.
+        total: generations of the whole run, the width of the axis.
+    """
+    figure, axes = new_figure(9.4, 4.2, 1, 2, width_ratios=[1, 1.25])
+    last, number = generations[-1], np.arange(1, len(generations) + 1)
+    draw_map(axes[0, 0], last["road"], last["paths"], last["returns"])
+    caption(axes[0, 0], f"generation {len(generations)}: all candidates (orange: the best)")
+    axis = axes[0, 1]
+    returns = np.array([own["returns"] for own in generations])
+    axis.plot(number, returns, ".", color=BLUE, ms=3, alpha=0.5)
+    axis.plot(number, returns.max(axis=1), color=ORANGE, lw=1.6, label="best candidate")
+    axis.plot(number, returns.mean(axis=1), color=BLUE, lw=2.2, label="average candidate")
+    axis.axhline(SOLVED, **THIN)
+    axis.set(xlabel="generation", ylabel="return of an episode", xlim=(0.5, total + 0.5))
+    axis.set_ylim(min(-20, returns.min() - 20), 960)
+    axis.legend(**SMALL, loc="upper left")
+    means = f"average return {returns[0].mean():.0f} at first, {returns[-1].mean():.0f} at last"
+    return describe(figure, title, f"{len(generations)} generations: {means}")
