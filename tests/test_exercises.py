@@ -126,7 +126,30 @@ def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(
     runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
     unread = sum(cell["solution"] for cell in points.values())
     told = [f"solution,{machine:.1f},0.0,{machine / 2},{unread}", "stub,0.0,1.5,1.5,0"]
-    assert capsys.readouterr().out.splitlines() == ["student,machine,person,mark,unread", *told]
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == ["student,machine,person,mark,unread", *told]
+    assert not printed.err
+
+
+@pytest.mark.parametrize("graded", GRADED, indirect=True)
+def test_points_by_hand_where_the_machine_grades_are_counted_and_warned_of(
+    graded, monkeypatch, capsys
+):
+    root, name = graded
+    cells = [grading(cell) for cell in read_cells(SOURCES[name])]
+    by_machine = next(cell["grade_id"] for cell in cells if cell["grade"] and not cell["solution"])
+    monkeypatch.chdir(root)
+    monkeypatch.setattr("sys.argv", ["marks.py", name])
+    with open_gradebook(root) as gradebook:
+        grade = gradebook.find_grade(by_machine, name, name, "stub")
+        grade.manual_score = 3.0
+        gradebook.db.commit()
+        runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
+        grade.manual_score = None
+        gradebook.db.commit()
+    printed = capsys.readouterr()
+    assert float(printed.out.splitlines()[-1].split(",")[2]) >= 3
+    assert re.fullmatch(rf"warning: stub has 3.0 points by hand on '{by_machine}'.*\n", printed.err)
 
 
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
