@@ -101,7 +101,7 @@ class Seat:
         # pictures would pile up in a slow browser.
         self.shown, self.sent, self.seen = 0, ipywidgets.IntText(), ipywidgets.IntText()
         self.answer = ipywidgets.jsdlink((self.sent, "value"), (self.seen, "value"))
-        size = {"width": f"{SIZE + 8}px", "height": f"{SIZE + 8}px"}
+        size = {"width": f"{SIZE}px", "height": f"{SIZE}px"}
         layers = [self.picture, self.ground, self.moment]
         self.stage = marked(ipywidgets.Box(layers, layout=size), "stage")
         self.view = ipywidgets.Box([self.stage, self._controls(), script()])

@@ -133,21 +133,35 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
     return describe(figure, title, lead, map(str, change))
 
 
-def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
-    """Driven paths from above: name -> (points (T, 2), whether the human drove, bool (T,))."""
+def plot_paths(
+    road: np.ndarray, paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str
+) -> Figure:
+    """Driven paths on the road, from above, one panel each.
+
+    Args:
+        road: centres of its tiles, world units (tiles, 2).
+        paths: name -> (where the car was, world units (T, 2); whether the human drove, bool (T,)).
+    """
     figure, axes = new_figure(max(3.4 * len(paths), 5.0), 3.9, 1, len(paths))
+    left, right = road_edges(road)
+    points = np.concatenate([own for own, _ in paths.values()])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, (high - low).max() / 2 + 2 * TRACK_WIDTH
     for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
-        drivers = ("agent", ~by_hand, BLUE, 4), ("human", by_hand, ORANGE, 12)
+        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85")
+        drivers = ("agent", ~by_hand, BLUE, 4), ("you, by hand", by_hand, ORANGE, 12)
         for driver, shown, color, size in drivers:
             if shown.any():
                 axis.scatter(*points[shown].T, label=driver, color=color, s=size)
-        axis.plot(*points[0], "^", color="black", ms=9, label="start")
-        caption(axis, name, "world units, to the right of the start")
-        axis.set_aspect("equal", adjustable="datalim")  # panels of one size
+        axis.plot(*points[0], "^", color="black", ms=7, label="start")
+        axis.plot(*points[-1], "x", color="black", ms=7, label="end")
+        caption(axis, name, "world units")
+        (x, y), far = middle, np.array([-reach, reach])
+        axis.set(xlim=x + far, ylim=y + far, aspect="equal")
         axis.legend(frameon=False, fontsize=8)
-    axes[0, 0].set_ylabel("world units, ahead of the start")
+    axes[0, 0].set_ylabel("world units")
     ends = [f"{name}: {len(own)} frames, {own.sum()} by hand" for name, (_, own) in paths.items()]
-    return describe(figure, title, "The car's path from above. ", ends)
+    return describe(figure, title, "The car's path on the road, from above. ", ends)
 
 
 def plot_road(
@@ -335,7 +349,10 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
 
 
 def plot_cma_es(
-    landscape: Callable[[np.ndarray], np.ndarray], generations: list[dict], shown: list[int]
+    landscape: Callable[[np.ndarray], np.ndarray],
+    generations: list[dict],
+    shown: list[int],
+    title: str = "Population (dots), mean (cross) and one-sigma ellipse of CMA-ES",
 ) -> Figure:
     """CMA-ES on a function of two variables: population and one-sigma ellipse of generations.
 
@@ -363,7 +380,6 @@ def plot_cma_es(
         axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         caption(axis, f"generation {index + 1}", "x")
     axes[0, 0].set_ylabel("y")
-    title = "Population (dots), mean (cross) and one-sigma ellipse of CMA-ES"
     describe(figure, title, "Generations ", (str(index + 1) for index in shown))
     if len(shown) < 3:
         figure.suptitle("Population, mean, ellipse", fontsize=11)  # for a narrow figure
@@ -601,3 +617,56 @@ def plot_learning(generations: list[dict], total: int, title: str) -> Figure:
     axis.legend(**SMALL, loc="upper left")
     means = f"average return {returns[0].mean():.0f} at first, {returns[-1].mean():.0f} at last"
     return describe(figure, title, f"{len(generations)} generations: {means}")
+
+
+def plot_ranks(ranks: dict[str, np.ndarray], title: str) -> Figure:
+    """Ranks of the same candidates in several contests: name -> ranks (candidates,), 1 the best.
+
+    A line for each candidate; the winner of the first contest is ORANGE.
+    """
+    figure, ((axis,),) = new_figure(6.5, 3.6)
+    table = np.array(list(ranks.values()))
+    winner = int(table[0].argmin())
+    for candidate in range(table.shape[1]):
+        if candidate != winner:
+            axis.plot(table[:, candidate], "o-", color=BLUE, alpha=0.35, ms=4)
+    label = "who won on the first"
+    axis.plot(table[:, winner], "o-", color=ORANGE, lw=2.5, ms=7, label=label)
+    axis.set(xticks=range(len(ranks)), xticklabels=list(ranks), ylabel="rank (1: the best)")
+    axis.set_ylim(table.max() + 1, 0)
+    legend_below(figure, axis)
+    places = [f"{name} rank {own[winner]}" for name, own in ranks.items()]
+    return describe(figure, title, "The winner of the first: ", places)
+
+
+def plot_dream(
+    real: np.ndarray,
+    dream: np.ndarray,
+    moment: int,
+    name: str,
+    steps: np.ndarray,
+    errors: dict[str, np.ndarray],
+) -> Figure:
+    """A moment of an episode beside its dream, and how far dreams are from reality by then.
+
+    Args:
+        real, dream: uint8 (T, 64, 64, 3) from the same moment on.
+        moment: the frame to show, from 0.
+        name: of the dream.
+        steps: of `errors`, 1 for the first dreamed frame.
+        errors: name -> error at these steps, 1 for that of the best constant picture.
+    """
+    figure, axes = new_figure(9.4, 3.0, 1, 3, width_ratios=[1, 1, 1.7])
+    for axis, picture, title in zip(axes[0], (real, dream), ("real", name), strict=False):
+        show_picture(axis, picture[moment])
+        caption(axis, title)
+    axis = axes[0, 2]
+    for (way, values), (color, dash) in zip(errors.items(), STYLES, strict=False):
+        axis.plot(steps, values, dash, color=color, label=way)
+    axis.axhline(1, **THIN)
+    axis.axvline(moment + 1, color="black", lw=1.5)
+    axis.set(xlabel="steps dreamed", ylabel="error (best constant = 1)", ylim=(0, None))
+    axis.legend(**SMALL, loc="lower right")
+    title = f"Step {moment + 1} of a dream ({(moment + 1) / 50:.1f} seconds)"
+    values = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
+    return describe(figure, title, "Real frame, dreamed frame, and errors at this step: ", values)
