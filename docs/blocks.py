@@ -25,6 +25,7 @@ from stad_lab.viz.replication import (
     TURNING,
     difference_of,
     plot_learning_curves,
+    plot_primary,
     plot_representation,
     plot_scores,
     plot_study,
@@ -93,8 +94,8 @@ def gains(claims: dict) -> str:
 
 
 def verdict_figure(claims: dict) -> str:
-    """The forest plot of study 1 for the overview."""
-    return image("study1", claims).replace("../notebooks", "notebooks")
+    """The two primary differences of study 1, for the overview."""
+    return image("study1_primary", claims).replace("../notebooks", "notebooks")
 
 
 def study1(claims: dict) -> str:
@@ -207,6 +208,7 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
     "study1": lambda claims: plot_study(claims["study1"]["comparisons"], MARGIN, PAPER_GAIN),
     "study1_scores": lambda claims: plot_scores(claims["study1"]["arms"]),
     "study1_curves": lambda claims: plot_learning_curves(claims["study1"]["curve_differences"]),
+    "study1_primary": lambda claims: plot_primary(claims["study1"]["comparisons"], MARGIN),
     "study3": lambda claims: plot_representation(claims["study3"]),
     "study3_random": lambda claims: plot_representation(claims["study3"], "random_driver"),
 }

@@ -118,6 +118,8 @@ def explain_widgets(app, doctree) -> None:
             if PROGRESS in bundle.astext():
                 bundle.parent.remove(bundle)
                 continue
+            if any(child.get("mime_type") == "text/html" for child in bundle.children):
+                continue  # it says by itself what it asks
             text = "This widget needs a running kernel: open the notebook in JupyterLab."
             note = nodes.paragraph("", text)
             if notebook in LIVE:

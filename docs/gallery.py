@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 PICTURES = NOTEBOOKS / "pictures"
-CELLS = ("00-11", "01-16", "02-17", "03-31", "04-08", "06-15")
+CELLS = ("00-11", "01-16", "02-17", "03-31", "04-19", "06-15")
 
 
 def figure_of(cell: str) -> bytes:

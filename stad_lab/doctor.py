@@ -71,14 +71,18 @@ class Report:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        """The summary and a table, open unless all is green; text and background as the page's."""
+        """The summary, and a table that is open if a line asks for something to be done.
+
+        An extra that is not complete asks for nothing. Text and background are the page's.
+        """
         rows = ""
         for line in self.lines:
             remedy = f"<br><b>{escape(line.remedy)}</b>" if line.remedy else ""
             mark = f'<span style="color: {COLORS[line.state]}">&#9679;</span> {line.state}'
             cells = (mark, escape(line.name), escape(line.found) + remedy)
             rows += "".join(["<tr>", *(f'<td align="left">{cell}</td>' for cell in cells), "</tr>"])
-        opened = "" if all(line.state == GREEN for line in self.lines) else " open"
+        quiet = all(line.state == GREEN or line.name.startswith("extra ") for line in self.lines)
+        opened = "" if quiet else " open"
         summary = f"<summary>{escape(self.summary)}</summary>"
         return f"<details{opened}>{summary}<table>{rows}</table></details>"
 

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from IPython.core.interactiveshell import InteractiveShell
+from traitlets.config import Config
 
-from stad_lab.checks import check
+from stad_lab.checks import WrongAnswer, ask, check
 
 RIGHT = np.array([0.5, -2.0, 3.0], np.float32)
 
@@ -19,7 +21,7 @@ def test_a_right_answer_passes_and_says_so(capsys):
 @pytest.mark.parametrize(
     ("found", "message"),
     [
-        (None, "f.x. is None: end your function with `return`"),
+        (None, "f.x.: is None: end your function with `return`"),
         ([0.5, -2.0, 3.0], "is a list: expected an array"),
         (torch.from_numpy(RIGHT), "is a tensor: expected an array: use .numpy"),
         ("0.5", "is of type str"),
@@ -45,10 +47,34 @@ def test_a_wrong_answer_gets_a_diagnosis(found, message):
         )
 
 
+def test_a_notebook_shows_a_wrong_answer_as_a_panel_without_a_traceback(capsys):
+    shell = InteractiveShell(config=Config({"HistoryManager": {"enabled": False}}))
+    shell.run_cell("def half(x):\n    return x.size / two")
+    shell.user_ns |= {"ask": ask, "check": check, "right": RIGHT}
+    shell.run_cell("check('f(x)', -right, right, {'the sign is turned round: add': -right})")
+    shell.run_cell("ask('half(x)', half, right)")
+    shown = capsys.readouterr().out
+    assert "Traceback" not in shown and "stad_lab/checks" not in shown and "---" not in shown
+    lines = [line.strip() for line in shown.splitlines()]
+    assert len(lines) == 7 and lines[1] == "What is wrong: the sign is turned round"
+    assert lines[2].startswith("Look at:") and lines[2].endswith("add")
+    assert "name 'two' is not defined" in lines[5] and lines[6].endswith("return x.size / two")
+
+
+def test_a_function_that_changes_what_it_is_given_is_told_to_copy():
+    def spoil(x):
+        x += 1
+        return x
+
+    for given in (RIGHT.copy(), torch.ones(2)):
+        with pytest.raises(WrongAnswer, match=r"changed an array that it was given: .*copy"):
+            ask("spoil(x)", spoil, given)
+
+
 @pytest.mark.parametrize(
     ("found", "expected", "message"),
     [
-        ([1.0, 2.0], [1.0, np.nan], "found 0 numbers that are not finite .*expected 1$"),
+        ([1.0, 2.0], [1.0, np.nan], "found 0 numbers that are not finite .*expected 1: "),
         (
             [np.nan, 2.0],
             [1.0, np.nan],
@@ -67,7 +93,7 @@ def test_answers_that_are_not_finite_get_a_diagnosis(found, expected, message):
 
 def test_a_list_of_tensors_with_gradients_is_refused():
     with pytest.raises(
-        AssertionError, match=r"this is no array, and cannot become one: .*requires grad"
+        AssertionError, match=r"is no array: and cannot become one: .*requires grad"
     ):
         check("the answer", [torch.ones(2, requires_grad=True)], [[1.0, 1.0]])
 

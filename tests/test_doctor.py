@@ -129,6 +129,7 @@ def test_what_an_extra_lacks_is_amber_because_only_some_need_it(packages):
     assert lab.state == "amber" and "stad_lab[lab]" in lab.remedy
     assert lab.found == "incomplete: ipywidgets (missing), jupyterlab (3.0)"
     assert line(report, "extra cluster").state == "green"
+    assert report._repr_html_().startswith("<details><summary>")  # nothing to be done: one line
 
 
 def test_optional_libraries_may_be_missing_but_not_broken(monkeypatch):

@@ -12,6 +12,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from stad_lab.envs import frames
+
 COURSE = Path(__file__).parent.parent / "notebooks" / "exercises"
 NAMES = sorted(folder.name for folder in (COURSE / "source").iterdir())
 SOURCES = {name: COURSE / "source" / name / f"{name}.ipynb" for name in NAMES}
@@ -126,7 +128,30 @@ def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(
     runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
     unread = sum(cell["solution"] for cell in points.values())
     told = [f"solution,{machine:.1f},0.0,{machine / 2},{unread}", "stub,0.0,1.5,1.5,0"]
-    assert capsys.readouterr().out.splitlines() == ["student,machine,person,mark,unread", *told]
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == ["student,machine,person,mark,unread", *told]
+    assert not printed.err
+
+
+@pytest.mark.parametrize("graded", GRADED, indirect=True)
+def test_points_by_hand_where_the_machine_grades_are_counted_and_warned_of(
+    graded, monkeypatch, capsys
+):
+    root, name = graded
+    cells = [grading(cell) for cell in read_cells(SOURCES[name])]
+    by_machine = next(cell["grade_id"] for cell in cells if cell["grade"] and not cell["solution"])
+    monkeypatch.chdir(root)
+    monkeypatch.setattr("sys.argv", ["marks.py", name])
+    with open_gradebook(root) as gradebook:
+        grade = gradebook.find_grade(by_machine, name, name, "stub")
+        grade.manual_score = 3.0
+        gradebook.db.commit()
+        runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
+        grade.manual_score = None
+        gradebook.db.commit()
+    printed = capsys.readouterr()
+    assert float(printed.out.splitlines()[-1].split(",")[2]) >= 3
+    assert re.fullmatch(rf"warning: stub has 3.0 points by hand on '{by_machine}'.*\n", printed.err)
 
 
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
@@ -193,6 +218,23 @@ def test_every_cell_of_the_solution_runs(graded):
     assert all(re.search('alt="[^"]{20,}"', "".join(picture)) for picture in pictures)
 
 
+@pytest.mark.parametrize("graded", GRADED, indirect=True)
+def test_an_open_exercise_ends_in_a_panel_and_not_in_a_traceback(graded):
+    root, name = graded
+    cells = read_cells(root / "autograded" / "stub" / name / f"{name}.ipynb")
+    outputs = [output for cell in cells for output in cell.get("outputs", [])]
+    panels = [output["traceback"] for output in outputs if output["output_type"] == "error"]
+    assert len(panels) >= 5 and all(len(panel) == 2 for panel in panels[:3])
+    assert all("Not done yet" in panel[0] for panel in panels[:3])
+
+
+def test_the_notebooks_do_not_show_what_their_checks_look_for():
+    for path in NOTEBOOKS:
+        checks = [cell for cell in read_cells(path) if grading(cell)["grade"]]
+        sources = [cell["source"] for cell in checks if not grading(cell)["solution"]]
+        assert sources and all(source.startswith("checks.") for source in sources)
+
+
 def test_the_student_versions_are_what_one_command_makes_of_the_sources(generator, tmp_path):
     made = generator.generate(tmp_path)
     assert [path.stem for path in made] == NAMES
@@ -255,7 +297,7 @@ def moments():
             for cell in read_cells(SOURCES[name]):
                 cell_grading = grading(cell)
                 needed = cell_grading["grade_id"] or re.search(
-                    r"^(def|import|from) ", cell["source"], re.MULTILINE
+                    r"^(def|import|from|sys\.stderr|quick)\b", cell["source"], re.MULTILINE
                 )
                 if (
                     cell["cell_type"] != "code"
@@ -289,7 +331,7 @@ def test_a_typical_wrong_answer_earns_the_message_that_names_it(
     moments, number, check, answer, message
 ):
     names, source = moments[number, check]
-    names = dict(names)
+    names = vars(frames) | names  # the wrong answers use what a student is to write
     exec(answer, names)
     with pytest.raises(AssertionError, match=message):
         exec(source, names)

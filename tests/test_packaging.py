@@ -281,10 +281,13 @@ def code_of(file):
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
 def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     ids, code = [cell["id"] for cell in cells_of(file)], code_of(file)
+    # The quiz, whose source gives its answers away:
+    folded = {cell["id"] for cell in cells_of(file) if "jupyter" in cell["metadata"]}
     assert all(re.fullmatch(file.stem[:2] + r"-\d\d", name) for name in ids)
     assert len(set(ids)) == len(ids)
     assert 15 <= len(ids) <= 40
-    assert [name for name, source in code.items() if len(source.splitlines()) > 15] == []
+    long = {name for name, source in code.items() if len(source.splitlines()) > 15}
+    assert long <= folded
     assert "check_environment()" in next(iter(code.values()))
 
 

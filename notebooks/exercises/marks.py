@@ -34,6 +34,22 @@ def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]
     return found
 
 
+def manual_on_machine_cells(gradebook: Gradebook, name: str) -> list[tuple[str, str, float]]:
+    """Manual scores where the machine grades: (student, cell, points).
+
+    A person may have given them, but so may a submission: it runs on the account that grades, and
+    can leave a process behind that edits gradebook.db.
+    """
+    notebook = gradebook.find_notebook(name, name)
+    by_hand = {cell.name for cell in notebook.solution_cells}
+    return [
+        (submission.student.id, grade.name, grade.manual_score)
+        for submission in gradebook.notebook_submissions(name, name)
+        for grade in submission.grades
+        if grade.manual_score is not None and grade.name not in by_hand
+    ]
+
+
 def read_marks(name: str) -> dict[str, tuple[float, float, int]]:
     """The marks in this folder's gradebook; without it, or the assignment, the program ends."""
     if not Path("gradebook.db").exists():
@@ -45,6 +61,9 @@ def read_marks(name: str) -> dict[str, tuple[float, float, int]]:
         except MissingEntry:
             known = ", ".join(assignment.name for assignment in gradebook.assignments)
             sys.exit(f"no assignment {name!r} in gradebook.db: choose one of {known}")
+        for student, cell, points in manual_on_machine_cells(gradebook, name):
+            told = f"has {points} points by hand on {cell!r}, which the machine grades"
+            print(f"warning: {student} {told}: did a person give them?", file=sys.stderr)
         return marks(gradebook, name)
 
 

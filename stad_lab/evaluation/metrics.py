@@ -226,3 +226,34 @@ def horizon_errors(
 def decode(vae: VAE, z: np.ndarray) -> np.ndarray:
     """The frames that V decodes from z (n, latent_size): float32 (n, 64, 64, 3) in [0, 1]."""
     return to_array(vae.decode(torch.from_numpy(z))[0])
+
+
+def two_peaks(logpi: np.ndarray, mean: np.ndarray, logsigma: np.ndarray) -> np.ndarray:
+    """The two highest peaks of the density of mixtures, each array (..., mixtures).
+
+    Returns:
+        float64 (..., 3): how far the density rises from the valley between them to the lower peak,
+        as a share of the higher one, and where the peaks are, from left to right; zeros where there
+        is only one peak.
+    """
+    shape, count = mean.shape[:-1], mean.shape[-1]
+    weight, center, sigma = (
+        part.reshape(-1, count).astype(np.float64)
+        for part in (np.exp(logpi), mean, np.exp(logsigma))
+    )
+    low, high = (center - 4 * sigma).min(axis=1), (center + 4 * sigma).max(axis=1)
+    z = low[:, None] + (high - low)[:, None] * np.linspace(0, 1, 200)
+    density = sum(
+        weight[:, [k]] / sigma[:, [k]] * np.exp(-0.5 * ((z - center[:, [k]]) / sigma[:, [k]]) ** 2)
+        for k in range(count)
+    )
+    inner = density[:, 1:-1]
+    is_peak = (inner > density[:, :-2]) & (inner >= density[:, 2:])
+    found = np.zeros((len(z), 3))
+    for row in np.flatnonzero(is_peak.sum(axis=1) > 1):
+        places = np.flatnonzero(is_peak[row]) + 1
+        left, right = np.sort(places[np.argsort(density[row, places])[-2:]])
+        lower, higher = np.sort(density[row, [left, right]])
+        rise = (lower - density[row, left : right + 1].min()) / higher
+        found[row] = rise, z[row, left], z[row, right]
+    return found.reshape(*shape, 3)

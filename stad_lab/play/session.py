@@ -46,6 +46,11 @@ def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"{name} {value!r}: expected one of {', '.join(choices)}")
 
 
+def pose_of(car: np.ndarray) -> tuple[float, float, float]:
+    """Position (world units) and heading (radians) of the hull of a `physics.CAR`."""
+    return (*car["position"][0].tolist(), float(car["angle"][0]))
+
+
 class Hand:
     """Keys as a driver. Keys are binary and steering is continuous, so the action is smoothed."""
 
@@ -89,6 +94,7 @@ class Session:
         dream: the DreamEnv; its `temperature` may be set.
         track: seed of the present track.
         score: return of the real episode so far.
+        best: of each track, the highest score of a whole episode that the human alone drove.
         earlier: the last four episodes before this one, as (track, Trajectory), newest last.
 
     The session changes the memory of its agent, so give it one of its own.
@@ -101,6 +107,7 @@ class Session:
         self.dreamer = Dreamer(self.dream, agent.parameters)
         self.earlier: deque[tuple[int, Trajectory]] = deque(maxlen=4)
         self.rows: list[tuple] = []
+        self.best: dict[int, float] = {}
         self.begin(track)
 
     @on_one_thread()
@@ -111,7 +118,7 @@ class Session:
         if self.rows:
             self.earlier.append((self.track, self.trajectory()))
         self.track, self.score, self.world = int(track), 0.0, "real"
-        self.rows, self.dream_rows, self.drivers = [], [], []
+        self.rows, self.dream_rows, self.drivers, self.poses = [], [], [], []
         self.real_ended, self.dream_ended = False, False
         self.hand.action = np.zeros(3, np.float32)
         self.observation, _ = self.env.reset(seed=self.track)
@@ -122,6 +129,20 @@ class Session:
     def ended(self) -> bool:
         """Whether the present world's episode is over: `begin` another, or `enter` the other."""
         return self.real_ended if self.world == "real" else self.dream_ended
+
+    @property
+    def car(self) -> np.ndarray:
+        """The real car's state, a record of `physics.CAR`."""
+        return self.env.unwrapped.cars.cars[0]
+
+    @property
+    def road(self) -> np.ndarray:
+        """Centres of the track's tiles from above, world units, float64 (tiles, 2)."""
+        return self.env.unwrapped.track[:, 2:]
+
+    def path(self) -> np.ndarray:
+        """Where the real car was in each frame so far, world units, float64 (T, 2)."""
+        return np.array(self.poses)[:, :2]
 
     def give(self, driver: str) -> None:
         """Let "hand" or "agent" drive (ValueError for others), from the last action on."""
@@ -172,12 +193,16 @@ class Session:
         action, motion = self._act(driver, self.proposed), true_motion(self.env.unwrapped.cars)
         if driver == "hand":  # M remembered the agent's action: replace it by the human's
             self.agent.remember(action[None], self.before)
+        pose = pose_of(self.car)
         following, reward, terminated, truncated, _ = self.env.step(action)
         # Drivers first: who reads `trajectory` and then `by_hand` meanwhile finds all of them.
         self.drivers.append(driver)
+        self.poses.append(pose)
         self.rows.append((self.observation, action, reward, motion))
         self.observation, self.score = following, self.score + reward
         self.real_ended = terminated or truncated
+        if self.real_ended and set(self.drivers) == {"hand"}:
+            self.best[self.track] = max(self.score, self.best.get(self.track, self.score))
         self._observe()
 
     def _step_dream(self, driver: str) -> None:

@@ -12,19 +12,28 @@ from pathlib import Path
 
 import ipywidgets
 
+from stad_lab.evaluation.trajectories import FRAMES_A_SECOND
+from stad_lab.play.dashboard import SIZE, STRIP, draw_background, draw_moment, end_lines
+from stad_lab.play.race import Ghost, drive_ghost
 from stad_lab.play.session import LAST_TRACK, Session
-from stad_lab.viz.plots import ORANGE
+from stad_lab.viz.plots import BLUE, ORANGE, PURPLE
 from stad_lab.viz.widgets import picture_png
 
-PICTURE_SIZE = 448  # pixels on the page
 LONGEST_WAIT = 0.2  # seconds to wait for a browser that has not shown the last pictures
 PEDAL_ICONS = {"gas": "up", "left": "left", "brake": "down", "right": "right"}
 HELP = f"""<style>.stad-lab-wire, .stad-lab-swap {{display: none}}
-.stad-lab-pixels {{image-rendering: pixelated; max-width: none; border: 4px solid transparent}}
-.stad-lab-pixels.stad-lab-listening {{border-color: {ORANGE}}}</style>
-<div style="line-height: 1.4">In an orange frame, the keys drive: from <b>drive</b> until <b>P</b>
-(pause) or <b>Esc</b>, and with the pointer on the picture. <b>Arrows</b> or <b>WASD</b> steer, give
-gas and brake; <b>T</b> hands over between you and the agent.</div>"""
+.stad-lab-stage {{position: relative; background: #111; border: 4px solid transparent;
+  box-sizing: content-box; overflow: hidden; flex: none}}
+.stad-lab-stage > * {{position: absolute; left: 0; top: 0; margin: 0}}
+.stad-lab-layer {{pointer-events: none}}
+.stad-lab-layer .widget-html-content {{line-height: 0}}
+.stad-lab-pixels {{image-rendering: pixelated; max-width: none; object-fit: fill; cursor: pointer}}
+.stad-lab-listening {{border-color: {ORANGE}}}
+.stad-lab-listening.stad-lab-agent {{border-color: {BLUE}}}
+.stad-lab-listening.stad-lab-dream {{border-color: {PURPLE}}}</style>
+<div style="line-height: 1.4"><b>Arrows</b> or <b>WASD</b> steer, give gas and brake. <b>T</b>: you
+or the agent. <b>R</b>: restart. <b>P</b> or <b>Esc</b>: pause. In a coloured frame all plain keys
+belong to the game: orange if you drive, blue if the agent does, purple in the dream.</div>"""
 
 
 class Loop(threading.Thread):
@@ -73,27 +82,33 @@ class Seat:
         stop_loops()
         self.session, self.loop, self.pace, self.error = session, None, 0.0, ""
         self.lock, self.described = threading.RLock(), 0.0  # when the status was last written
-        size = {"width": PICTURE_SIZE, "height": PICTURE_SIZE}
-        self.picture = marked(ipywidgets.Image(format="png", **size), "pixels")
+        self.ghost: Ghost | None = None  # the agent's lap of the present track
+        self.picture = marked(ipywidgets.Image(format="png", width=SIZE, height=SIZE), "pixels")
+        self.ground, self.moment = (marked(ipywidgets.HTML(), "layer") for _ in range(2))
         self.status = ipywidgets.HTML()
         self.go = marked(ipywidgets.ToggleButton(description="drive", icon="play"), "drive")
         self.driver = choice({"you": "hand", "the agent": "agent"}, session.driver)
         self.world = choice({"the real track": "real", "the dream": "dream"}, session.world)
         temperature = session.dream.temperature
         self.temperature = ipywidgets.FloatSlider(temperature, min=0.1, max=2.5, step=0.05)
-        self.speed = ipywidgets.IntSlider(30, min=10, max=50)
+        self.speed = ipywidgets.IntSlider(FRAMES_A_SECOND, min=10, max=FRAMES_A_SECOND)
         self.track = ipywidgets.BoundedIntText(session.track, min=0, max=LAST_TRACK)
         self.begin = ipywidgets.Button(description="begin", icon="flag")
+        self.again = marked(ipywidgets.Button(description="restart", icon="undo"), "again")
         self.wire = marked(ipywidgets.Text(), "wire")  # the held pedals, from keys.js
         self.swap = marked(ipywidgets.Button(), "swap")  # what keys.js clicks for T
         # The browser copies every tenth picture's number back, and the loop waits for it: otherwise
         # pictures would pile up in a slow browser.
         self.shown, self.sent, self.seen = 0, ipywidgets.IntText(), ipywidgets.IntText()
         self.answer = ipywidgets.jsdlink((self.sent, "value"), (self.seen, "value"))
+        size = {"width": f"{SIZE}px", "height": f"{SIZE}px"}
+        layers = [self.picture, self.ground, self.moment]
+        self.stage = marked(ipywidgets.Box(layers, layout=size), "stage")
+        self.view = ipywidgets.Box([self.stage, self._controls(), script()])
+        marked(self.view, "seat").layout.flex_flow = "row wrap"
         self._connect()
+        self._prepare()
         self.show()
-        self.view = marked(ipywidgets.Box([self.picture, self._controls(), script()]), "seat")
-        self.view.layout.flex_flow = "row wrap"
 
     def _controls(self) -> ipywidgets.VBox:
         size = {"width": "76px", "height": "40px"}
@@ -101,15 +116,18 @@ class Seat:
             marked(ipywidgets.Button(icon=f"arrow-{icon}", tooltip=pedal, layout=size), pedal)
             for pedal, icon in PEDAL_ICONS.items()
         )
-        for control, width in ((self.go, 240), (self.track, 110), (self.begin, 124)):
+        for control, width in ((self.go, 118), (self.again, 118), (self.begin, 100)):
             control.layout.width = f"{width}px"
+        self.track.layout.width = "110px"
+        settings = [ipywidgets.Label("temperature of the dream"), self.temperature]
+        settings += [ipywidgets.Label("frames a second (the real car: 50)"), self.speed]
+        settings += [ipywidgets.Label("track"), ipywidgets.HBox([self.track, self.begin])]
+        folded = ipywidgets.Accordion([ipywidgets.VBox(settings)], selected_index=None)
+        folded.set_title(0, "temperature, pace, track")
         cross = {"align_items": "center", "width": "240px"}
-        rows = [self.status, self.go, self.driver, self.world]
-        rows += [ipywidgets.Label("temperature of the dream"), self.temperature]
-        rows += [ipywidgets.Label("frames a second (the real car: 50)"), self.speed]
-        rows += [ipywidgets.Label("track"), ipywidgets.HBox([self.track, self.begin])]
+        rows = [self.status, ipywidgets.HBox([self.go, self.again]), self.driver, self.world]
         rows += [ipywidgets.VBox([gas, ipywidgets.HBox(others)], layout=cross)]
-        rows += [ipywidgets.HTML(HELP), self.wire, self.swap]
+        rows += [ipywidgets.HTML(HELP), folded, self.wire, self.swap]
         return ipywidgets.VBox(rows, layout={"width": "330px", "margin": "0 0 0 16px"})
 
     def _connect(self) -> None:
@@ -120,12 +138,15 @@ class Seat:
         for control, act in acts.items():
             control.observe(lambda change, act=act: act(change["new"]), "value")
         self.swap.on_click(lambda _: self.change_driver())
-        self.begin.on_click(lambda _: self.begin_track())
+        self.begin.on_click(lambda _: self.begin_track(self.track.value))
+        self.again.on_click(lambda _: self.begin_track(self.session.track))
 
     def hold(self, pedals: str) -> None:
         """Hold these pedals, "gas left" for example, and release all others."""
         self.session.hand.hold(*pedals.split())
         self.described = 0.0  # the loop shows it with the next picture
+        if not self.go.value:
+            self.show()
 
     def change_driver(self) -> None:
         """Hand over between human and agent; another cell may have done so since the last time."""
@@ -146,10 +167,19 @@ class Seat:
             self.loop.stopped.set()
         self.go.description, self.go.icon = ("pause", "pause") if on else ("drive", "play")
 
-    def begin_track(self) -> None:
-        """Begin an episode on the chosen track, and drive."""
-        self._command(self.session.begin, self.track.value)
+    def begin_track(self, track: int) -> None:
+        """Begin an episode on a track, and drive."""
+        with self.lock:
+            self.session.begin(track)
+            self._prepare()
         self.world.value, self.go.value = "real", True
+        self.show()
+
+    def _prepare(self) -> None:
+        """Let the agent drive its own lap of the track, and draw what does not move."""
+        if self.ghost is None or self.ghost.track != self.session.track:
+            self.ghost = drive_ghost(self.session.agent, self.session.track)
+        self.ground.value = draw_background(self.session.road)
 
     def advance(self) -> bool:
         """Drive and show one frame; False if the episode has ended."""
@@ -168,8 +198,16 @@ class Seat:
     def show(self, every: float = 0.0) -> None:
         """Show the picture, and the status unless it is younger than `every` seconds."""
         with self.lock:
-            picture = self.session.picture()
+            if self.ghost.track != self.session.track:  # another cell began an episode
+                self._prepare()
+            picture, drawn = self.session.picture(), draw_moment(self.session, self.ghost)
+        cropped = self.session.world == "dream" and self.session.agent.world_model.crop_bar
+        self.picture.height = str(SIZE - STRIP if cropped else SIZE)  # the road in its proportions
         self.picture.value = picture_png(picture, len(picture))
+        self.moment.value = drawn
+        colors = {"agent": self.session.driver == "agent", "dream": self.session.world == "dream"}
+        for name, holds in colors.items():
+            (self.stage.add_class if holds else self.stage.remove_class)(f"stad-lab-{name}")
         self.shown += 1
         if self.shown % 10 == 0:  # an answer costs the page as much as some pictures
             self.sent.value = self.shown
@@ -177,6 +215,9 @@ class Seat:
             self.described = time.perf_counter()
             pace = self.pace if self.go.value else 0.0
             self.status.value = describe(self.session, pace, self.error)
+            if self.session.real_ended:  # for screen readers: the picture's card is a drawing
+                told = html.escape(". ".join(end_lines(self.session, self.ghost)))
+                self.status.value += f'<div style="line-height: 1.4">{told}</div>'
 
     def browser_is_behind(self) -> bool:
         """Whether a browser is there and has not answered for more than 15 pictures."""

@@ -133,21 +133,35 @@ def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
     return describe(figure, title, lead, map(str, change))
 
 
-def plot_paths(paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str) -> Figure:
-    """Driven paths from above: name -> (points (T, 2), whether the human drove, bool (T,))."""
+def plot_paths(
+    road: np.ndarray, paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str
+) -> Figure:
+    """Driven paths on the road, from above, one panel each.
+
+    Args:
+        road: centres of its tiles, world units (tiles, 2).
+        paths: name -> (where the car was, world units (T, 2); whether the human drove, bool (T,)).
+    """
     figure, axes = new_figure(max(3.4 * len(paths), 5.0), 3.9, 1, len(paths))
+    left, right = road_edges(road)
+    points = np.concatenate([own for own, _ in paths.values()])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle, reach = (low + high) / 2, (high - low).max() / 2 + 2 * TRACK_WIDTH
     for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
-        drivers = ("agent", ~by_hand, BLUE, 4), ("human", by_hand, ORANGE, 12)
+        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85")
+        drivers = ("agent", ~by_hand, BLUE, 4), ("you, by hand", by_hand, ORANGE, 12)
         for driver, shown, color, size in drivers:
             if shown.any():
                 axis.scatter(*points[shown].T, label=driver, color=color, s=size)
-        axis.plot(*points[0], "^", color="black", ms=9, label="start")
-        caption(axis, name, "world units, to the right of the start")
-        axis.set_aspect("equal", adjustable="datalim")  # panels of one size
+        axis.plot(*points[0], "^", color="black", ms=7, label="start")
+        axis.plot(*points[-1], "x", color="black", ms=7, label="end")
+        caption(axis, name, "world units")
+        (x, y), far = middle, np.array([-reach, reach])
+        axis.set(xlim=x + far, ylim=y + far, aspect="equal")
         axis.legend(frameon=False, fontsize=8)
-    axes[0, 0].set_ylabel("world units, ahead of the start")
+    axes[0, 0].set_ylabel("world units")
     ends = [f"{name}: {len(own)} frames, {own.sum()} by hand" for name, (_, own) in paths.items()]
-    return describe(figure, title, "The car's path from above. ", ends)
+    return describe(figure, title, "The car's path on the road, from above. ", ends)
 
 
 def plot_road(
@@ -162,11 +176,9 @@ def plot_road(
         reach: how far that panel extends to each side, world units.
     """
     figure, axes = new_figure(8.6, 4.3, 1, 2)
-    along = np.roll(road, -1, axis=0) - np.roll(road, 1, axis=0)
-    across = TRACK_WIDTH * along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1, keepdims=True)
-    edges = [np.concatenate([edge, edge[:1]]) for edge in (road + across, road - across)]
+    left, right = road_edges(road)
     for axis in axes[0]:
-        axis.fill(*np.concatenate([edges[0], edges[1][::-1]]).T, color="0.85", label="road")
+        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85", label="road")
         for (name, path), (color, dash) in zip(paths.items(), STYLES, strict=False):
             axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
             axis.plot(*path[-1], "x", color=color, ms=7)
@@ -337,7 +349,10 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
 
 
 def plot_cma_es(
-    landscape: Callable[[np.ndarray], np.ndarray], generations: list[dict], shown: list[int]
+    landscape: Callable[[np.ndarray], np.ndarray],
+    generations: list[dict],
+    shown: list[int],
+    title: str = "Population (dots), mean (cross) and one-sigma ellipse of CMA-ES",
 ) -> Figure:
     """CMA-ES on a function of two variables: population and one-sigma ellipse of generations.
 
@@ -365,7 +380,6 @@ def plot_cma_es(
         axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         caption(axis, f"generation {index + 1}", "x")
     axes[0, 0].set_ylabel("y")
-    title = "Population (dots), mean (cross) and one-sigma ellipse of CMA-ES"
     describe(figure, title, "Generations ", (str(index + 1) for index in shown))
     if len(shown) < 3:
         figure.suptitle("Population, mean, ellipse", fontsize=11)  # for a narrow figure
@@ -537,3 +551,122 @@ def plot_intervals(
             axes[0, 0].plot([], [], mark, color=color, label=name)
         legend_below(figure, axes[0, 0])
     return describe(figure, title, "; ".join(values))
+
+
+# Candidates on the map
+
+
+def road_edges(road: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Both edges of a lap, closed: centres of its tiles (tiles, 2) -> (tiles + 1, 2) each."""
+    along = np.roll(road, -1, axis=0) - np.roll(road, 1, axis=0)
+    across = TRACK_WIDTH * along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1, keepdims=True)
+    left, right = (np.concatenate([edge, edge[:1]]) for edge in (road + across, road - across))
+    return left, right
+
+
+def draw_map(axis: Axes, road: np.ndarray, paths: list[np.ndarray], returns: np.ndarray) -> None:
+    """A lap from above with the path of each car: the best in ORANGE, the others in BLUE."""
+    left, right = road_edges(road)
+    axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.87")
+    best = int(np.argmax(returns))
+    for place, path in enumerate(paths):
+        if place != best:
+            axis.plot(*path.T, color=BLUE, lw=1.0, alpha=0.6)
+            axis.plot(*path[-1], ".", color=BLUE, ms=5)
+    axis.plot(*paths[best].T, color=ORANGE, lw=2.2)
+    axis.plot(*paths[best][-1], ".", color=ORANGE, ms=9)
+    axis.plot(*road[0], "^", color="black", ms=7)
+    low, high = road.min(axis=0) - 35, road.max(axis=0) + 35  # a car may end far in the grass
+    axis.set(xticks=[], yticks=[], aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    axis.spines[:].set_visible(False)
+
+
+def plot_maps(maps: dict[str, tuple], title: str) -> Figure:
+    """Laps from above: name -> (road (tiles, 2), paths of cars (T, 2) each, returns (cars,))."""
+    rows = -(-len(maps) // 5)
+    columns = -(-len(maps) // rows)
+    figure, axes = new_figure(min(2.6 * columns, 10.5) + 0.2, 2.9 * rows + 0.4, rows, columns)
+    for axis, (name, (road, paths, returns)) in zip(axes.flat, maps.items(), strict=False):
+        draw_map(axis, road, paths, returns)
+        caption(axis, f"{name}: best {returns.max():.0f}" if len(returns) > 1 else name)
+    for axis in axes.flat[len(maps) :]:
+        axis.set_visible(False)
+    bests = [f"{name}, best return {own[2].max():.0f}" for name, own in maps.items()]
+    return describe(figure, title, "Laps from above (triangle: start, dot: end). ", bests)
+
+
+def plot_learning(generations: list[dict], total: int, title: str) -> Figure:
+    """The last generation on its map, beside the returns of all so far.
+
+    Args:
+        generations: each {"road", "paths", "returns"} as `plot_maps` takes them.
+        total: generations of the whole run, the width of the axis.
+    """
+    figure, axes = new_figure(9.4, 4.2, 1, 2, width_ratios=[1, 1.25])
+    last, number = generations[-1], np.arange(1, len(generations) + 1)
+    draw_map(axes[0, 0], last["road"], last["paths"], last["returns"])
+    caption(axes[0, 0], f"generation {len(generations)}: all candidates (orange: the best)")
+    axis = axes[0, 1]
+    returns = np.array([own["returns"] for own in generations])
+    axis.plot(number, returns, ".", color=BLUE, ms=3, alpha=0.5)
+    axis.plot(number, returns.max(axis=1), color=ORANGE, lw=1.6, label="best candidate")
+    axis.plot(number, returns.mean(axis=1), color=BLUE, lw=2.2, label="average candidate")
+    axis.axhline(SOLVED, **THIN)
+    axis.set(xlabel="generation", ylabel="return of an episode", xlim=(0.5, total + 0.5))
+    axis.set_ylim(min(-20, returns.min() - 20), 960)
+    axis.legend(**SMALL, loc="upper left")
+    means = f"average return {returns[0].mean():.0f} at first, {returns[-1].mean():.0f} at last"
+    return describe(figure, title, f"{len(generations)} generations: {means}")
+
+
+def plot_ranks(ranks: dict[str, np.ndarray], title: str) -> Figure:
+    """Ranks of the same candidates in several contests: name -> ranks (candidates,), 1 the best.
+
+    A line for each candidate; the winner of the first contest is ORANGE.
+    """
+    figure, ((axis,),) = new_figure(6.5, 3.6)
+    table = np.array(list(ranks.values()))
+    winner = int(table[0].argmin())
+    for candidate in range(table.shape[1]):
+        if candidate != winner:
+            axis.plot(table[:, candidate], "o-", color=BLUE, alpha=0.35, ms=4)
+    label = "who won on the first"
+    axis.plot(table[:, winner], "o-", color=ORANGE, lw=2.5, ms=7, label=label)
+    axis.set(xticks=range(len(ranks)), xticklabels=list(ranks), ylabel="rank (1: the best)")
+    axis.set_ylim(table.max() + 1, 0)
+    legend_below(figure, axis)
+    places = [f"{name} rank {own[winner]}" for name, own in ranks.items()]
+    return describe(figure, title, "The winner of the first: ", places)
+
+
+def plot_dream(
+    real: np.ndarray,
+    dream: np.ndarray,
+    moment: int,
+    name: str,
+    steps: np.ndarray,
+    errors: dict[str, np.ndarray],
+) -> Figure:
+    """A moment of an episode beside its dream, and how far dreams are from reality by then.
+
+    Args:
+        real, dream: uint8 (T, 64, 64, 3) from the same moment on.
+        moment: the frame to show, from 0.
+        name: of the dream.
+        steps: of `errors`, 1 for the first dreamed frame.
+        errors: name -> error at these steps, 1 for that of the best constant picture.
+    """
+    figure, axes = new_figure(9.4, 3.0, 1, 3, width_ratios=[1, 1, 1.7])
+    for axis, picture, title in zip(axes[0], (real, dream), ("real", name), strict=False):
+        show_picture(axis, picture[moment])
+        caption(axis, title)
+    axis = axes[0, 2]
+    for (way, values), (color, dash) in zip(errors.items(), STYLES, strict=False):
+        axis.plot(steps, values, dash, color=color, label=way)
+    axis.axhline(1, **THIN)
+    axis.axvline(moment + 1, color="black", lw=1.5)
+    axis.set(xlabel="steps dreamed", ylabel="error (best constant = 1)", ylim=(0, None))
+    axis.legend(**SMALL, loc="lower right")
+    title = f"Step {moment + 1} of a dream ({(moment + 1) / 50:.1f} seconds)"
+    values = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
+    return describe(figure, title, "Real frame, dreamed frame, and errors at this step: ", values)

@@ -147,3 +147,24 @@ def plot_representation(study3: dict, driver: str = "agent") -> Figure:
         for row in rows
     ]
     return describe(figure, title, "Mean R2 from z: ", told)
+
+
+def plot_primary(comparisons: dict[str, dict], margin: float) -> Figure:
+    """The two primary differences of study 1, for the overview: `input_output` less `frame`.
+
+    Args:
+        comparisons, margin: as of `plot_study`.
+    """
+    figure, ((axis,),) = new_figure(7.6, 2.5)
+    axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
+    axis.axvline(0, color="black", linewidth=0.8)
+    primary = {seen: comparisons[f"{name}: input_output"] for name, seen in SEEN.items()}
+    for height, one in enumerate(primary.values()):
+        plot_comparison(axis, height, one, COLOURS["input_output"])
+    name_rows(axis, primary)
+    axis.set_xlabel("points more or less than without difference images")
+    handles = {name: one for one, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, fontsize=9)
+    told = [f"{seen} {difference_of(one)}, {one['verdict']}" for seen, one in primary.items()]
+    lead = f"Means of {len(one['by_seed'])} seeds with 95% intervals: "
+    return describe(figure, "What difference images change", lead, ["; ".join(told)])

@@ -21,6 +21,7 @@ from stad_lab.evaluation.metrics import (
     region_masks,
     repeat_prediction,
     single_step_nll,
+    two_peaks,
     vae_metrics,
 )
 from stad_lab.evaluation.trajectories import record_random_trajectory
@@ -184,3 +185,12 @@ def test_horizon_errors_are_zero_for_the_truth_and_grow_with_what_is_dreamed_wro
     errors = horizon_errors(vae, real + growing * signs, mu, awake=8, steps=[1, 5, 12])
     assert errors["one dream"][0] < 1e-3 < errors["one dream"][1] < errors["one dream"][2]
     assert errors["mean of the dreams"][2] < errors["one dream"][2]
+
+
+def test_two_peaks_are_found_with_the_valley_between_them_and_one_peak_is_not():
+    even, narrow = np.log([0.5, 0.5]), np.log([0.1, 0.1])
+    rise, left, right = two_peaks(even, np.array([-1.0, 2.0]), narrow)
+    assert rise > 0.95 and abs(left + 1) < 0.05 and abs(right - 2) < 0.05
+    one = two_peaks(even, np.array([-0.05, 0.05]), narrow)
+    both = two_peaks(*(np.stack([part] * 2) for part in (even, even, narrow)))
+    assert not one.any() and both.shape == (2, 3) and not both.any()

@@ -6,10 +6,13 @@ How keys reach it is tested in test_browser.py.
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from stad_lab import load_agent
-from stad_lab.play.session import Session
+from stad_lab.play.dashboard import SIZE, end_lines, to_screen
+from stad_lab.play.race import drive_ghost
+from stad_lab.play.session import Session, pose_of
 from stad_lab.play.widget import Loop, Seat
 
 
@@ -154,3 +157,43 @@ def test_the_car_waits_for_a_slow_browser_and_for_none_that_is_not_there(make_se
     assert seat.browser_is_behind()
     seat.seen.value = 30
     assert not seat.browser_is_behind()
+
+
+def test_the_agents_lap_is_driven_beside_and_drawn_where_the_camera_would_see_it(make_seat):
+    seat = make_seat()
+    session = seat.session
+    alone = drive_ghost(session.agent, session.track)
+    assert np.array_equal(seat.ghost.poses, alone.poses) and alone.score > 900
+    session.give("agent")
+    for _ in range(60):
+        session.step()
+    assert np.allclose(session.path(), alone.poses[:60, :2])
+    pose = pose_of(session.car)
+    own = to_screen(np.array([pose[:2]]), pose, 1.2)[0]
+    assert own == pytest.approx([SIZE / 2, SIZE * 3 / 4])  # where the observation shows the car
+    seat.show()
+    assert seat.moment.value.count("<polygon") == 1 and "ahead by" in seat.moment.value
+    assert alone.behind(int(session.car["tiles_visited"]), len(session.rows)) < 0.5
+
+
+def test_an_episode_by_hand_counts_and_one_with_help_does_not_and_restart_keeps_the_track(
+    make_seat,
+):
+    seat = make_seat()
+    session = seat.session
+    step = session.env.step
+    session.env.step = lambda action: (*step(action)[:2], len(session.rows) > 8, False, {})
+    for driver in ("hand", "agent"):
+        session.give(driver)
+        while not session.ended:
+            session.step()
+        card = ". ".join(end_lines(session, seat.ghost))
+        assert f"{session.score:.0f} points" in card and f"{seat.ghost.score:.0f} points" in card
+        assert ("does not count" in card) == (driver == "agent")
+        seat.show()
+        assert "once more" in seat.moment.value
+        best = session.best[session.track]
+        session.begin(session.track)
+    assert best == session.best[session.track]
+    seat.again.click()
+    assert seat.go.value and session.track == 3 and not session.real_ended

@@ -179,7 +179,7 @@ def test_the_pages_have_every_result_of_the_study(found):
     assert f"without it {gain}, *gain*" in blocks.gains(claims)
     assert blocks.verdict(claims).count("\n- ") == 5
     assert "](../notebooks/pictures/study1.png)" in page
-    assert "](notebooks/pictures/study1.png)" in blocks.verdict_figure(claims)
+    assert "](notebooks/pictures/study1_primary.png)" in blocks.verdict_figure(claims)
     assert "](../notebooks/pictures/study1_curves.png)" in blocks.outcomes(claims)
 
 

@@ -10,6 +10,7 @@ from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.replication.study_claims import FEATURES, MARGIN
 from stad_lab.viz.replication import (
     plot_learning_curves,
+    plot_primary,
     plot_representation,
     plot_scores,
     plot_study,
@@ -78,3 +79,11 @@ def test_every_network_has_its_line():
     marks = [line for line in figure.axes[2].lines if line.get_marker() == "|"]
     assert len(marks) == 2 * 5 and all(np.size(line.get_xdata()) == 3 for line in marks)
     assert "12 V networks" in figure.get_label() and "yaw rate of input 0.50" in figure.get_label()
+
+
+def test_the_overviews_figure_has_the_two_primary_differences_and_no_other(comparisons):
+    figure = plot_primary(comparisons, MARGIN)
+    drawn = [list(line.get_xdata()) for line in figure.axes[0].lines]
+    for name, one in comparisons.items():
+        assert (one["interval"] in drawn) == name.endswith(": input_output")
+    assert figure.get_label().count("undecided") == 2 and "Means of 4 seeds" in figure.get_label()
