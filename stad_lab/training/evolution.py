@@ -359,10 +359,9 @@ def drive_group(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Drive a group of cars: (returns, lengths). Runs in a worker."""
     single_thread()
-    if isinstance(source, Path | WorldModel):
-        episodes = drive(make_agent(source, parameters), tracks, fast, **limits or {})
-    else:
-        episodes = source.drive(parameters, tracks, **limits or {})
+    if not isinstance(source, Path | WorldModel):
+        return source.drive(parameters, tracks, **limits or {})[:2]
+    episodes = drive(make_agent(source, parameters), tracks, fast, **limits or {})
     return episodes.returns, episodes.lengths
 
 
