@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from stad_lab.compete.limits import Limits
 from stad_lab.config import PRESETS, REPORTED_TRACKS, STUDY_TRACKS, Config
 
 CONTINUES = (
@@ -26,6 +27,7 @@ CONTINUES = (
     "replicate",
     "latents",
     "probe-study",
+    "compete",
 )  # after an interrupt
 PROGRAM = "python -m stad_lab"
 # Packages that a few commands need, and the extras that bring them.
@@ -516,6 +518,50 @@ def film(
     print(f"filmed to {file}")
 
 
+def compete(
+    submissions: tyro.conf.Positional[Path | None] = None,
+    out: str = "competition",
+    secret: Path | None = None,
+    commit: Path | None = None,
+    tracks: int = 50,
+    check: Path | None = None,
+    kit: Path | None = None,
+    reveal: bool = False,
+    processes: int = 2,
+    limits: Limits = Limits(),  # noqa: B008
+) -> int | None:
+    """Rank the agents of a class on hidden tracks, each in a process of its own.
+
+    Stop it when you like; the same command continues.
+
+    Args:
+        submissions: Folder with one Python file with make_agent(), or one folder, for each agent.
+        out: Folder of the results and of leaderboard.html.
+        secret: The file of hidden tracks, made by --commit.
+        commit: Draw hidden tracks, write them to this file, and print the hash to publish; of a
+            file that exists only the hash is printed.
+        tracks: How many to draw.
+        check: Try one submission on three public tracks, as its author would.
+        kit: Write a first agent to this file, to begin from.
+        reveal: Print seeds and salt on the leaderboard.
+        processes: Submissions that drive at once.
+        limits: What a submission may use.
+    """
+    from stad_lab.compete import run
+
+    if kit:
+        return print(run.write_kit(kit))
+    if commit:
+        return print(run.hide_tracks(commit, tracks))
+    if check:
+        said = run.check_submission(check, limits)
+        print(said)
+        return int(said.startswith("FAILED"))
+    if not submissions or not secret:
+        raise ValueError("expected a folder of submissions and --secret FILE, made by --commit")
+    print(f"written to {run.run(submissions, secret, output(out), limits, processes, reveal)}")
+
+
 COMMANDS: dict[str, Callable] = {
     "check": check,
     "train": training_command(PRESETS["laptop"]),
@@ -531,4 +577,5 @@ COMMANDS: dict[str, Callable] = {
     "benchmark": benchmark,
     "ship": ship,
     "film": film,
+    "compete": compete,
 }
