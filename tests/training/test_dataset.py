@@ -1,7 +1,6 @@
 """The random driver's dataset: complete, checked, and the same after any interrupt."""
 
 import hashlib
-import json
 import shutil
 import signal
 import subprocess
@@ -22,7 +21,6 @@ from stad_lab.training.dataset import (
     MANIFEST,
     Dataset,
     RandomDriver,
-    check_seen,
     collect,
     drive_randomly,
     episode_file,
@@ -295,16 +293,3 @@ def test_an_unfinished_collection_is_not_taken_for_a_dataset(copied):
     save_json(copied / MANIFEST, manifest | {"episodes": []})
     with pytest.raises(ValueError, match=r"holds 0 of 8 episodes: collect"):
         Dataset(copied)
-
-
-def test_a_dataset_of_the_first_edition_is_refused_with_the_version_that_reads_it(tmp_path):
-    settings = {"episodes": 8, "episode_frames": 60, "seed": 0}
-    save_json(tmp_path / MANIFEST, {"settings": settings, "blocks": []})
-    for read in (
-        Dataset,
-        lambda folder: collect(QUICK, folder),
-        lambda folder: check_seen(folder / "vae.safetensors", "a checksum", folder),
-    ):
-        with pytest.raises(ValueError, match=r"manifest.json was written by stad_lab 0\.1"):
-            read(tmp_path)
-    assert json.loads((tmp_path / MANIFEST).read_text())["settings"] == settings
