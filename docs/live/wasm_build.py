@@ -201,16 +201,12 @@ def build() -> None:
         subprocess.run(linker, check=True)
     pictures = picture.make_pictures()
     TABLES.write_bytes(b"".join(np.ascontiguousarray(one).tobytes() for one in pictures))
-    fields = {name: [physics.CAR.fields[name][1], str(physics.CAR[name])] for name in physics.CAR.names}
     facts = {
         "sources": checksums(),
         "made_with": {"numba": numba.__version__, "llvmlite": llvmlite.__version__},
         "module": hashlib.sha256(ENGINE.read_bytes()).hexdigest(),
-        "car": {"size": physics.CAR.itemsize, "fields": {n: at for n, (at, _) in fields.items()}},
-        "road": {
-            "size": physics.ROAD.itemsize,
-            "fields": {name: physics.ROAD.fields[name][1] for name in physics.ROAD.names},
-        },
+        "car": layout(physics.CAR),
+        "road": layout(physics.ROAD),
         "ground": {"size": picture.SIZE, "rim": picture.RIM, "period": picture.PERIOD,
                    "cells": picture.CELLS},
         "tables": [one.nbytes for one in pictures],
@@ -218,6 +214,14 @@ def build() -> None:
     }  # fmt: skip
     FACTS.write_text(json.dumps(facts, indent=1) + "\n", encoding="utf-8")
     print(f"{ENGINE}: {ENGINE.stat().st_size:,} bytes; {TABLES}: {TABLES.stat().st_size:,} bytes")
+
+
+def layout(record) -> dict:
+    """The size of a record in bytes, and where its fields begin."""
+    return {
+        "size": record.itemsize,
+        "fields": {name: record.fields[name][1] for name in record.names},
+    }
 
 
 def default_colors() -> list:
