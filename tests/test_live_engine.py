@@ -41,8 +41,8 @@ DRIVE = """([seed, actions, pictured]) => {
             found.pictures.push([car.frame(), car.frame(true), car.observation()].map(base64))
         found.rewards.push(car.step(action))
         const bytes = new Uint8Array(engine.memory.buffer, car.car, engine.facts.car.size)
-        if (frame % 20 === 0 || car.over) found.states.push(base64(bytes))
-        if (car.over) break
+        if (frame % 20 === 0 || car.ending) found.states.push(base64(bytes))
+        if (car.ending) break
     }
     return found
 }"""
