@@ -139,7 +139,7 @@ def help_screen_readers(app, page, template, context, doctree) -> None:
 
 def style_live_page(app, page, template, context, doctree) -> None:
     """Give the live pages their own style sheet."""
-    if page.startswith("docs/live/"):
+    if page.startswith("docs/live/") or page == "docs/index":  # which shows the game
         app.add_css_file("../docs/live/live.css", priority=900)
 
 

@@ -163,8 +163,8 @@ def run_layer(x: np.ndarray, layer: Layer, y: np.ndarray) -> None:
 
 
 @compiled
-def run_encoder(frames, earlier, pictures, layers, first, second):
-    """The last layer's outputs; `pictures`, `first` and `second` are memory to work in."""
+def write_pictures(frames, earlier, pictures):
+    """What V sees of uint8 (cars, 64, 64, 3): float32 (cars, 64, 64, 3), or 6 with differences."""
     channels = pictures.shape[-1]
     for car in range(len(frames)):
         for row in range(FRAME_SIZE):
@@ -175,6 +175,12 @@ def run_encoder(frames, earlier, pictures, layers, first, second):
                     if channels == 6:
                         before = PIXELS[earlier[car, row, column, color]]
                         pictures[car, row, column, 3 + color] = value - before
+
+
+@compiled
+def run_encoder(frames, earlier, pictures, layers, first, second):
+    """The last layer's outputs; `pictures`, `first` and `second` are memory to work in."""
+    write_pictures(frames, earlier, pictures)
     x, y, other = pictures.reshape(-1), first, second
     for layer in layers:
         run_layer(x, layer, y)

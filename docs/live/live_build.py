@@ -9,6 +9,7 @@ the pages they are multiplied into one layer, which makes a V of 2.2 MB one of 0
 """
 
 import base64
+import gzip
 import json
 import shutil
 from pathlib import Path
@@ -19,6 +20,8 @@ from safetensors.numpy import load_file, save
 HERE = Path(__file__).parent
 PRETRAINED = HERE.parents[1] / "stad_lab" / "pretrained"
 AGENTS = ("frame", "input", "output", "input_output", "cropped_input")
+# What a worker runs: a page that is opened from the disk cannot give it a file.
+WORKER = ("engine", "layers", "vae", "mdn_rnn", "random", "hand", "race_worker")
 
 
 def fold_decoder(vae: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -48,9 +51,21 @@ def encoded(content: bytes) -> str:
     return base64.b64encode(content).decode()
 
 
+def engine() -> dict[str, object]:
+    """The compiled engine: module and tables (gzip, base64), facts, and the worker's source."""
+    folder, js = HERE / "engine", HERE / "js"
+    packed = {
+        name: encoded(gzip.compress((folder / file).read_bytes(), mtime=0))
+        for name, file in (("code", "engine.wasm"), ("tables", "tables.bin"))
+    }
+    source = "\n".join((js / f"{name}.js").read_text(encoding="utf-8") for name in WORKER)
+    facts = json.loads((folder / "engine.json").read_text(encoding="utf-8"))
+    return {**packed, "facts": facts, "source": source}
+
+
 def data() -> dict[str, object]:
     """Everything that the pages may load: name -> JSON value, weights and pictures as base64."""
-    found: dict[str, object] = {}
+    found: dict[str, object] = {"engine": engine()}
     for agent in AGENTS:
         folder = PRETRAINED / agent
         found[f"vae_{agent}"] = encoded(save(fold_decoder(load_file(folder / "vae.safetensors"))))

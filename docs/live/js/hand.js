@@ -18,6 +18,7 @@ stad.Hand = class {
   constructor() {
     this.held = new Map(); // key or button that is down -> its pedal
     this.action = new Float32Array(3); // the last one, which may be C's
+    this.gamepad = null;
   }
 
   /** The next action, one small change from the last one. As stad_lab/play/session.py. */
@@ -35,7 +36,7 @@ stad.Hand = class {
       const step = towards ? press[i] : release[i];
       this.action[i] += Math.max(-step, Math.min(step, wanted - now));
     });
-    const gamepad = stad.readGamepad();
+    const gamepad = this.gamepad ?? stad.readGamepad(); // a worker is told what the page has read
     if (gamepad) this.action.set(gamepad);
     return this.action.slice();
   }

@@ -1,0 +1,504 @@
+"use strict";
+// The page "Race the agent": draws what the worker drives, and passes on keys, touch and gamepad.
+
+stad.start(async () => {
+  const get = stad.get;
+  const AGENTS = ["frame", "input", "output", "input_output", "cropped_input"];
+  const [ORANGE, BLUE, PURPLE] = ["#E69F00", "#0072B2", "#CC79A7"];
+  const [FIELD, VIEW] = [333, 62]; // world units: half the field, and the height of the picture
+  const lacking = whatIsMissing();
+  if (lacking) throw new Error(lacking);
+
+  let [track, state, before, arrived] = [null, null, null, 0];
+  let [best, asleep, sleptAt] = [readBest(), false, null];
+  let { seed, agent } = readAddress();
+  const held = new Map();
+  const worker = await startWorker();
+  get("agent").value = agent;
+
+  // --- The worker ---------------------------------------------------------------------------------
+
+  async function startWorker() {
+    const { code, tables, facts, source } = await stad.load("engine");
+    const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
+    const found = new Worker(url);
+    found.addEventListener("message", ({ data }) => receive(data));
+    found.addEventListener("error", (event) => stad.fail(new Error(event.message)));
+    const bytes = await Promise.all([code, tables].map(unpack));
+    found.postMessage({ type: "load", code: bytes[0], facts, tables: bytes[1] });
+    return found;
+  }
+
+  /** Bytes of a gzip file in base64. */
+  async function unpack(base64) {
+    const packed = new Blob([await stad.decodeBase64(base64)]).stream();
+    const stream = packed.pipeThrough(new DecompressionStream("gzip"));
+    return new Uint8Array(await new Response(stream).arrayBuffer());
+  }
+
+  /** Give the worker the networks of an agent. */
+  async function choose(name) {
+    const names = [`vae_${name}`, `mdn_rnn_${name}`, `controller_${name}`];
+    const [vae, mdnRnn, c] = await Promise.all(names.map(stad.loadTensors));
+    if (name !== agent) return; // another one was chosen meanwhile
+    const controller = Float64Array.from(c.parameters.data);
+    const networks = { vae, mdnRnn, controller, decoder: vae, cropBar: name.startsWith("cropped") };
+    worker.postMessage({ type: "choose", networks });
+  }
+
+  function receive(message) {
+    if (message.type === "error") return stad.fail(new Error(message.text.split("\n")[0]));
+    if (message.type === "track") {
+      track = prepare(message.track);
+      return;
+    }
+    if (message.type !== "state") return;
+    [before, state, arrived] = [state, message, performance.now()];
+    if (before?.phase !== state.phase) changePhase(before?.phase);
+    if (message.seen) showSeen(message.seen);
+    tell();
+  }
+
+  // --- Drawing ------------------------------------------------------------------------------------
+
+  /** The road as paths: one for each shade, and the whole as a line for the map. */
+  function prepare(found) {
+    const shades = ["#666", "#696969", "#6b6b6b"].map((color) => ({ color, path: new Path2D() }));
+    const kerbs = ["#fff", "#e8342c"].map((color) => ({ color, path: new Path2D() }));
+    const polygon = (path, corners, i) => {
+      path.moveTo(corners[8 * i], corners[8 * i + 1]);
+      for (let k = 1; k < 4; k++) path.lineTo(corners[8 * i + 2 * k], corners[8 * i + 2 * k + 1]);
+      path.closePath();
+    };
+    for (let i = 0; i < found.count; i++) polygon(shades[i % 3].path, found.tiles, i);
+    found.kerbTiles.forEach((tile, i) => polygon(kerbs[tile % 2].path, found.kerbs, i));
+    const line = Array.from({ length: found.count }, (_, i) => [
+      found.path[4 * i + 2],
+      found.path[4 * i + 3],
+    ]);
+    const [xs, ys] = [line.map(([x]) => x), line.map(([, y]) => y)];
+    const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+    return { ...found, layers: [...shades, ...kerbs], line, box };
+  }
+
+  /** A pose between the last two steps, so that the picture moves at the screen's rate. */
+  function between(name, share) {
+    const [now, was] = [state[name].pose, before?.[name].pose];
+    if (!was || Math.hypot(now.x - was.x, now.y - was.y) > 10) return now; // a new episode
+    const mix = (a, b) => a + (b - a) * share;
+    const wheels = now.wheels.map((one, i) => one.map((value, k) => mix(was.wheels[i][k], value)));
+    const [x, y, angle] = ["x", "y", "angle"].map((part) => mix(was[part], now[part]));
+    return { x, y, angle, wheels, speed: now.speed };
+  }
+
+  function draw() {
+    requestAnimationFrame(draw);
+    if (!state || !track || document.hidden) return;
+    const cleared = stad.clearCanvas(get("race"));
+    if (!cleared) return;
+    const { context, width, height } = cleared;
+    const share = Math.min(1, (performance.now() - arrived) / 20);
+    const cars = { you: between("you", share), rival: between("rival", share) };
+    const shown = state.phase === "attract" ? cars.rival : cars.you;
+    const scale = height / VIEW;
+    context.save();
+    context.fillStyle = "#5fae57";
+    context.fillRect(0, 0, width, height);
+    context.translate(width / 2, height * 0.72);
+    context.scale(scale, -scale);
+    context.rotate(-shown.angle);
+    context.translate(-shown.x, -shown.y);
+    drawGrass(context, shown, width / scale);
+    for (const { color, path } of track.layers) {
+      context.fillStyle = color;
+      context.fill(path);
+    }
+    drawStart(context);
+    if (state.phase === "attract") drawCar(context, cars.rival, BLUE, 1);
+    else {
+      drawCar(context, cars.rival, BLUE, 0.65);
+      drawCar(context, cars.you, ORANGE, 1);
+    }
+    context.restore();
+    drawMap(context, width, height, cars);
+    drawSpeed(context, width, height, shown.speed);
+  }
+
+  function drawGrass(context, { x, y }, wide) {
+    const [square, reach] = [FIELD / 10, Math.max(VIEW, wide)];
+    context.fillStyle = "#56a44e";
+    const first = (value) => Math.floor((value - reach) / (2 * square)) * 2 * square;
+    for (let left = first(x); left < x + reach; left += 2 * square)
+      for (let low = first(y); low < y + reach; low += 2 * square)
+        context.fillRect(left, low, square, square);
+  }
+
+  function drawStart(context) {
+    context.fillStyle = "#fff";
+    const corners = track.tiles.subarray(0, 8);
+    context.beginPath();
+    context.moveTo(corners[0], corners[1]);
+    context.lineTo(corners[2], corners[3]);
+    context.lineWidth = 0.8;
+    context.strokeStyle = "#fff";
+    context.stroke();
+  }
+
+  // The car of Gymnasium, in world units.
+  const HULL = [
+    [-1.2, 2.6, 1.2, 2.6, 1.2, 2.2, -1.2, 2.2],
+    [-0.3, 2.4, 0.3, 2.4, 1, 0.4, -1, 0.4],
+    [0.5, 0.5, 1, 0.2, 1, -1, 0.4, -1.8, -0.4, -1.8, -1, -1, -1, 0.2, -0.5, 0.5],
+    [-1, -2.4, 1, -2.4, 1, -1.8, -1, -1.8],
+  ];
+
+  function drawCar(context, { x, y, angle, wheels }, color, alpha) {
+    context.globalAlpha = alpha;
+    for (const [wheelX, wheelY, turn, phase] of wheels) {
+      context.save();
+      context.translate(wheelX, wheelY);
+      context.rotate(turn);
+      context.fillStyle = "#111";
+      context.fillRect(-0.28, -0.54, 0.56, 1.08);
+      const place = 0.54 * Math.sin(phase);
+      context.fillStyle = "#999";
+      if (Math.cos(phase) > 0) context.fillRect(-0.28, place - 0.08, 0.56, 0.16);
+      context.restore();
+    }
+    context.save();
+    context.translate(x, y);
+    context.rotate(angle);
+    context.fillStyle = color;
+    for (const corners of HULL) {
+      context.beginPath();
+      for (let i = 0; i < corners.length; i += 2) context.lineTo(corners[i], corners[i + 1]);
+      context.fill();
+    }
+    context.restore();
+    context.globalAlpha = 1;
+  }
+
+  function drawMap(context, width, height, cars) {
+    const side = Math.min(150, 0.3 * width);
+    const [left, low, right, high] = track.box;
+    const scale = (side - 16) / Math.max(right - left, high - low);
+    const place = ([x, y]) => [
+      width - side - 8 + 8 + (x - left) * scale,
+      8 + 8 + (high - y) * scale,
+    ];
+    context.fillStyle = "#fffd";
+    context.beginPath();
+    context.roundRect(width - side - 8, 8, side, (high - low) * scale + 16, 8);
+    context.fill();
+    stad.strokeLine(context, [...track.line, track.line[0]].map(place), "#777", 3);
+    stad.fillDot(context, place([cars.rival.x, cars.rival.y]), 5, BLUE);
+    if (state.phase !== "attract") stad.fillDot(context, place([cars.you.x, cars.you.y]), 5, ORANGE);
+  }
+
+  function drawSpeed(context, width, height, speed) {
+    context.fillStyle = "#000a";
+    context.beginPath();
+    context.roundRect(8, height - 44, 132, 36, 8);
+    context.fill();
+    context.fillStyle = "#fff";
+    context.font = "600 15px system-ui, sans-serif";
+    context.fillText(`speed ${Math.round(speed)}`, 18, height - 28);
+    context.fillStyle = speed > 70 ? "#ff8a5c" : "#9fd49a";
+    context.fillRect(18, height - 22, Math.min(1, speed / 100) * 112, 6);
+  }
+
+  function showSeen({ frame, earlier, z, decoded }) {
+    const scaled = (bytes) => Float32Array.from(bytes, (value) => value / 255);
+    const [now, then] = [scaled(frame), scaled(earlier)];
+    const dreams = state.asleep && state.phase !== "over";
+    stad.paintFrame(get("frame"), now);
+    stad.paintDifference(get("difference"), stad.differenceImage(now, then));
+    stad.paintFrame(get("decoded"), decoded);
+    if (dreams) stad.paintFrame(get("dreamed"), decoded);
+    drawBars(z);
+  }
+
+  function drawBars(z) {
+    const cleared = stad.clearCanvas(get("bars"));
+    if (!cleared) return;
+    const { context, width, height } = cleared;
+    const step = width / z.length;
+    z.forEach((value, i) => {
+      const size = Math.max(-1, Math.min(1, value / 3)) * (height / 2 - 2);
+      context.fillStyle = asleep ? PURPLE : BLUE;
+      context.fillRect(i * step + 1, height / 2, Math.max(1, step - 2), -size);
+    });
+  }
+
+  // --- Words --------------------------------------------------------------------------------------
+
+  const seconds = (frames) => (frames / stad.FRAMES_A_SECOND).toFixed(1);
+  const set = (id, text) => {
+    if (get(id).textContent !== text) get(id).textContent = text;
+  };
+
+  function tell() {
+    const { you, rival, phase } = state;
+    const mine = phase === "attract" ? "0" : you.score.toFixed(0);
+    set("your-score", mine);
+    set("rival-score", rival.score.toFixed(0));
+    const time = phase === "attract" ? rival.frames : you.frames;
+    set("time", `${seconds(time)} s`);
+    const driven = Math.round(100 * you.tiles);
+    const text = {
+      attract: `The agent ${agent} drives on track ${seed}. Press an arrow key to race it.`,
+      race: `You race on track ${seed}: ${driven}% of the lap, ${mine} points.`,
+      paused: `Paused at ${driven}% of the lap.`,
+      over: `The race is over: you ${mine}, the agent ${rival.score.toFixed(0)} points.`,
+    }[phase];
+    stad.describe(get("race"), text);
+  }
+
+  function changePhase(was) {
+    const { phase } = state;
+    get("live").dataset.phase = phase;
+    get("card").hidden = phase === "race";
+    get("dream").hidden = true;
+    [get("again").hidden, get("share").hidden] = [phase === "attract", phase === "attract"];
+    set("pause", phase === "paused" ? "Go on" : "Pause");
+    get("pause").disabled = phase !== "race" && phase !== "paused";
+    get("eyes").disabled = get("auto").disabled = phase !== "race";
+    if (phase !== "race" && phase !== "paused") wake();
+    if (phase === "attract") showStart();
+    if (phase === "paused") showCard("Paused", "Press P or an arrow key to go on.");
+    if (phase === "over") showEnd();
+    if (phase === "race" && was === "attract") stad.announce("The race has begun.");
+  }
+
+  function showCard(title, text) {
+    set("card-title", title);
+    set("card-text", text);
+  }
+
+  function showStart() {
+    showCard("Beat the agent", "It drives now. Press an arrow key, or touch the picture, to race it.");
+  }
+
+  function showEnd() {
+    const { you, rival } = state;
+    const [mine, its] = [you.score, rival.score];
+    const title = mine > its ? "You beat the agent!" : mine === its ? "A draw" : "The agent wins";
+    const ways = ["The time is up", "A whole lap", "You left the field"];
+    const record = mine > (best[seed] ?? -Infinity);
+    if (record) {
+      best[seed] = mine;
+      localStorage.setItem("stad-race", JSON.stringify(best));
+    }
+    const text =
+      `${ways[you.ending]} after ${seconds(you.frames)} s. You ${mine.toFixed(1)} points, ` +
+      `the agent ${its.toFixed(1)}. Your best on this track: ${best[seed].toFixed(1)}` +
+      `${record ? ", just now" : ""}.`;
+    showCard(title, text);
+    stad.announce(`${title} ${text}`);
+  }
+
+  function readBest() {
+    try {
+      return JSON.parse(localStorage.getItem("stad-race")) ?? {};
+    } catch {
+      return {}; // without storage nothing is kept
+    }
+  }
+
+  // --- Address, eyes and controls -----------------------------------------------------------------
+
+  function readAddress() {
+    const asked = new URLSearchParams(location.hash.slice(1));
+    const [wanted, number] = [asked.get("agent"), asked.get("track")];
+    const found = /^\d{1,9}$/.test(number ?? "") ? Number(number) : 5;
+    return { seed: found, agent: AGENTS.includes(wanted) ? wanted : "frame" };
+  }
+
+  function writeAddress() {
+    history.replaceState(null, "", `#track=${seed}&agent=${agent}`);
+    set("seed", String(seed));
+  }
+
+  function drive(newSeed) {
+    seed = newSeed;
+    writeAddress();
+    worker.postMessage({ type: "track", seed });
+    worker.postMessage({ type: "begin", phase: "attract" });
+  }
+
+  function begin() {
+    wake();
+    setAuto(false);
+    worker.postMessage({ type: "begin", phase: "race" });
+    get("seat").focus({ preventScroll: true });
+  }
+
+  function toggleEyes() {
+    if (state?.phase !== "race") return;
+    asleep = !asleep;
+    if (asleep) sleptAt = state.you.frames;
+    worker.postMessage({ type: "eyes", closed: asleep });
+    get("dream").hidden = !asleep;
+    set("eyes", asleep ? "Open the eyes" : "Close the eyes");
+    const slept = seconds(state.you.frames - (sleptAt ?? 0));
+    stad.announce(asleep ? "The eyes are closed: you see the dream." : `Awake after ${slept} s.`);
+  }
+
+  function setAuto(on) {
+    worker.postMessage({ type: "autopilot", on });
+    get("auto").setAttribute("aria-pressed", String(on));
+    set("auto", on ? "Drive yourself" : "Let C drive");
+  }
+
+  function wake() {
+    if (!asleep) return;
+    asleep = false;
+    worker.postMessage({ type: "eyes", closed: false });
+    get("dream").hidden = true;
+    set("eyes", "Close the eyes");
+  }
+
+  function setPaused(paused) {
+    worker.postMessage({ type: "pause", paused });
+  }
+
+  function sendPedals() {
+    const pads = stad.readGamepad();
+    const auto = touching && !held.has("brake") ? ["gas"] : []; // gas by itself
+    worker.postMessage({ type: "pedals", held: [...held.values(), ...auto], gamepad: pads });
+  }
+
+  /** A driver has touched a pedal: begin, or go on. */
+  function wish() {
+    if (state?.phase === "attract") begin();
+    else if (state?.phase === "paused") setPaused(false);
+  }
+
+  let touching = false;
+  const KEYS = {
+    ArrowLeft: "left", ArrowRight: "right", ArrowUp: "gas", ArrowDown: "brake",
+    KeyA: "left", KeyD: "right", KeyW: "gas", KeyS: "brake",
+  }; // prettier-ignore
+
+  document.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.altKey || event.metaKey) return;
+    if (event.target.matches("input, select, textarea")) return;
+    if (event.key === "Escape") {
+      setPaused(true);
+      document.activeElement.blur();
+      return;
+    }
+    const racing = state?.phase === "race" || get("seat").contains(document.activeElement);
+    const idle = state?.phase === "attract" && document.activeElement === document.body;
+    if (!racing && !idle) return;
+    if (event.key.toLowerCase() === "p" && !event.repeat)
+      return setPaused(state.phase === "race");
+    if (event.key.toLowerCase() === "e" && !event.repeat) return toggleEyes();
+    const pedal = KEYS[event.code];
+    if (!pedal) return;
+    event.preventDefault();
+    if (event.repeat) return;
+    held.set(event.code, pedal);
+    touching = false;
+    if (get("auto").getAttribute("aria-pressed") === "true") setAuto(false);
+    wish();
+    sendPedals();
+  });
+  addEventListener("keyup", ({ code }) => {
+    if (held.delete(code)) sendPedals();
+  });
+  addEventListener("blur", () => {
+    held.clear();
+    sendPedals();
+    setPaused(true);
+  });
+  document.addEventListener("visibilitychange", () => document.hidden && setPaused(true));
+
+  // Touch: the left and the right half of the picture steer.
+  get("race").addEventListener("pointerdown", (event) => {
+    if (event.pointerType === "mouse" && state?.phase !== "attract") return;
+    event.preventDefault();
+    get("seat").focus({ preventScroll: true });
+    if (event.pointerType !== "mouse") {
+      touching = true;
+      const { left, width } = get("race").getBoundingClientRect();
+      held.set(event.pointerId, event.clientX < left + width / 2 ? "left" : "right");
+      get("race").setPointerCapture(event.pointerId);
+    }
+    wish();
+    sendPedals();
+  });
+  for (const end of ["pointerup", "pointercancel", "lostpointercapture"])
+    get("race").addEventListener(end, ({ pointerId }) => held.delete(pointerId) && sendPedals());
+  const brake = get("brake");
+  const press = (down) => (event) => {
+    event.preventDefault();
+    if (down) held.set("brake", "brake");
+    else held.delete("brake");
+    sendPedals();
+  };
+  brake.addEventListener("pointerdown", press(true));
+  for (const end of ["pointerup", "pointercancel", "pointerleave"])
+    brake.addEventListener(end, press(false));
+  setInterval(() => stad.readGamepad() && (wish(), sendPedals()), 40);
+
+  get("card").addEventListener("click", () => state?.phase === "attract" && begin());
+  get("again").addEventListener("click", begin);
+  get("another").addEventListener("click", () => drive(Math.floor(Math.random() * 10000)));
+  get("pause").addEventListener("click", () => setPaused(state.phase === "race"));
+  get("eyes").addEventListener("click", toggleEyes);
+  get("auto").addEventListener("click", () =>
+    setAuto(get("auto").getAttribute("aria-pressed") === "false"),
+  );
+  get("agent").addEventListener("change", ({ target }) => {
+    agent = target.value;
+    writeAddress();
+    choose(agent).catch(stad.fail);
+  });
+  get("share").addEventListener("click", async () => {
+    try {
+      await navigator.clipboard.writeText(location.href);
+      stad.announce("The link is copied.");
+      set("share", "Copied");
+    } catch {
+      set("share", location.href); // no clipboard: show it
+    }
+  });
+  addEventListener("hashchange", () => {
+    const asked = readAddress();
+    if (asked.agent !== agent) {
+      agent = get("agent").value = asked.agent;
+      choose(agent).catch(stad.fail);
+    }
+    if (asked.seed !== seed) drive(asked.seed);
+  });
+
+  function whatIsMissing() {
+    if (typeof WebAssembly !== "object") return "It needs WebAssembly, which this browser lacks.";
+    if (typeof Worker === "undefined") return "It needs workers, which this browser lacks.";
+    if (typeof DecompressionStream === "undefined")
+      return "It needs a newer browser, with DecompressionStream.";
+    // A module with one SIMD instruction.
+    const simd = [
+      0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253,
+      15, 253, 98, 11,
+    ];
+    if (!WebAssembly.validate(Uint8Array.from(simd)))
+      return "It needs WebAssembly SIMD, which this browser lacks.";
+    return null;
+  }
+
+  await choose(agent);
+  if (stad.prefersStill()) {
+    seed = readAddress().seed;
+    writeAddress();
+    worker.postMessage({ type: "track", seed });
+    worker.postMessage({ type: "begin", phase: "attract" });
+    worker.postMessage({ type: "begin", phase: "waiting" });
+  } else drive(seed);
+  await new Promise((done) => {
+    const timer = setInterval(() => state && track && (clearInterval(timer), done()), 10);
+  });
+  stad.page = { worker, get state() { return state; }, get track() { return track; } }; // prettier-ignore
+  requestAnimationFrame(draw);
+});

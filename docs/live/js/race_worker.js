@@ -1,0 +1,187 @@
+"use strict";
+// The race, in a worker: the true engine, the reader's car, the agent's car, and what each driver
+// sees. 50 steps a second; after each the page is told where the cars are.
+
+stad.Racer = class {
+  /**
+   * One car and its driver's eyes and memory.
+   * @param {stad.Engine} engine
+   * @param {object} networks tensors of V, M and C, see `load` below
+   */
+  constructor(engine, networks) {
+    this.car = engine.makeCar();
+    const { vae, mdnRnn, controller, cropBar } = networks;
+    this.agent = engine.makeAgent(vae, mdnRnn, controller, cropBar);
+    this.mixture = new stad.MDNRNN(mdnRnn);
+  }
+
+  reset(track) {
+    this.car.reset(track);
+    this.agent.reset();
+    [this.asleep, this.frame] = [false, null];
+  }
+
+  /** What the driver sees next: z of the true frame, or of the dream while the eyes are closed. */
+  see(random) {
+    if (this.asleep) {
+      this.agent.z = Float32Array.from(this.mixture.mixture(this.agent.h).sample(1, random));
+      return;
+    }
+    this.frame = this.car.frame(this.agent.cropBar);
+    this.agent.see(this.frame);
+  }
+
+  /** Drive one frame with this action, or with C's. */
+  drive(action = this.agent.control()) {
+    this.agent.remember(action);
+    this.car.step(action);
+    return action;
+  }
+
+  report() {
+    const { car } = this;
+    const facts = { score: car.score, frames: car.frames, over: car.over, ending: car.ending };
+    return { ...facts, tiles: car.tilesVisited / car.track.count, pose: car.pose() };
+  }
+};
+
+stad.Race = class {
+  constructor(post) {
+    this.post = post;
+    this.hand = new stad.Hand();
+    this.random = new stad.Random(1);
+    this.phase = "waiting"; // "attract": the agent drives alone; "race"; "paused"; "over"
+    this.inset = true;
+    this.steps = 0;
+  }
+
+  async load({ code, facts, tables }) {
+    this.engine = await stad.Engine.make(code, facts, tables);
+    this.post({ type: "loaded" });
+  }
+
+  /** The networks of an agent: it drives the ghost, and its V and M are also the reader's. */
+  choose(networks) {
+    this.engine = this.engine ?? null;
+    this.memoryTop ??= this.engine.memory.top;
+    this.engine.memory.top = this.memoryTop; // the earlier cars and networks are forgotten
+    [this.you, this.rival] = [0, 1].map(() => new stad.Racer(this.engine, networks));
+    this.vae = new stad.VAE(networks.decoder);
+    if (this.track) this.begin(this.phase === "race" ? "attract" : this.phase);
+  }
+
+  setTrack(seed) {
+    this.track = this.engine.makeTrack(seed);
+    this.post({ type: "track", track: this.track });
+  }
+
+  begin(phase) {
+    for (const racer of [this.you, this.rival]) racer.reset(this.track);
+    this.you.autopilot = false;
+    this.hand.action.fill(0);
+    [this.phase, this.due] = [phase, performance.now()];
+    this.tell(true);
+    this.schedule();
+  }
+
+  schedule() {
+    clearTimeout(this.timer);
+    if (this.phase !== "attract" && this.phase !== "race") return;
+    this.timer = setTimeout(() => this.tick(), Math.max(0, this.due - performance.now()));
+  }
+
+  tick() {
+    const [now, interval] = [performance.now(), 1000 / stad.FRAMES_A_SECOND];
+    this.due = Math.max(this.due + interval, now - 3 * interval); // a slow device never lags behind
+    this.step();
+    this.tell(false);
+    this.schedule();
+  }
+
+  step() {
+    this.steps += 1;
+    const { you, rival } = this;
+    if (!rival.car.over) {
+      rival.see(this.random);
+      rival.drive();
+    } else if (this.phase === "attract") return this.begin("attract");
+    if (this.phase !== "race") return;
+    you.see(this.random);
+    const action = you.autopilot ? undefined : this.hand.act();
+    this.action = you.drive(action);
+    this.hand.action.set(this.action);
+    if (you.car.over) this.finish();
+  }
+
+  /** The reader's episode is over: the agent's is driven to its end at once. */
+  finish() {
+    const { rival } = this;
+    while (!rival.car.over) {
+      rival.see(this.random);
+      rival.drive();
+    }
+    this.phase = "over";
+    this.tell(true);
+  }
+
+  /** Tell the page what it draws; what a driver sees comes less often, as V has to decode it. */
+  tell(complete) {
+    const { you, rival } = this;
+    const shown = this.phase === "attract" ? rival : you;
+    const message = {
+      type: "state",
+      phase: this.phase,
+      time: performance.now(),
+      you: you.report(),
+      rival: rival.report(),
+      asleep: shown.asleep,
+      action: Array.from(this.phase === "attract" ? rival.agent.control() : this.hand.action),
+    };
+    const often = you.asleep && this.phase === "race" ? 2 : 5; // steps
+    if (this.inset && shown.frame && (complete || this.steps % often === 0)) {
+      const decoded = this.vae.decode(shown.agent.z);
+      const { past } = shown.agent;
+      const earlier = past.length > stad.STRIDE ? past[0] : shown.frame;
+      message.seen = { frame: shown.frame, earlier, z: shown.agent.z, decoded: decoded.frame };
+    }
+    this.post(message);
+  }
+
+  pause(paused) {
+    if (paused && this.phase === "race") this.phase = "paused";
+    else if (!paused && this.phase === "paused") [this.phase, this.due] = ["race", performance.now()];
+    else return;
+    this.tell(false);
+    this.schedule();
+  }
+
+  closeEyes(closed) {
+    if (this.you.frame || !closed) this.you.asleep = closed;
+  }
+};
+
+stad.STRIDE ??= 4; // k of the shipped V
+stad.FRAME_SIZE ??= 64;
+
+if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScope) {
+  const race = new stad.Race((message) => postMessage(message));
+  const acts = {
+    load: (message) => race.load(message),
+    choose: ({ networks }) => race.choose(networks),
+    track: ({ seed }) => race.setTrack(seed),
+    begin: ({ phase }) => race.begin(phase),
+    pause: ({ paused }) => race.pause(paused),
+    eyes: ({ closed }) => race.closeEyes(closed),
+    autopilot: ({ on }) => (race.you.autopilot = on),
+    inset: ({ shown }) => (race.inset = shown),
+    pedals: ({ held, gamepad }) => {
+      race.hand.held = new Map(held.map((pedal, i) => [i, pedal]));
+      race.hand.gamepad = gamepad;
+    },
+  };
+  onmessage = ({ data }) => {
+    Promise.resolve()
+      .then(() => acts[data.type](data))
+      .catch((error) => postMessage({ type: "error", text: String(error.stack ?? error) }));
+  };
+}
