@@ -67,6 +67,7 @@ ACT = """async ([name, seed, frames]) => {
 def page(browser, live_pages):
     """A page with the engine and a car in it."""
     page = browser.new_page(reduced_motion="reduce")
+    page.set_default_timeout(60_000)  # milliseconds: a busy machine is no fault
     page.goto((live_pages / "race.html").as_uri())
     page.wait_for_selector("#live[data-state=ready]")
     page.evaluate(LOAD)

@@ -179,8 +179,9 @@ if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScop
       race.hand.gamepad = gamepad;
     },
   };
+  let last = Promise.resolve(); // one after the other: the engine may still be compiling
   onmessage = ({ data }) => {
-    Promise.resolve()
+    last = last
       .then(() => acts[data.type](data))
       .catch((error) => postMessage({ type: "error", text: String(error.stack ?? error) }));
   };
