@@ -46,7 +46,8 @@ def fill(page: str, claims: dict) -> str:
 
 def pages() -> list[Path]:
     """All pages that may have markers."""
-    found = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    docs = ROOT / "docs"
+    found = [ROOT / "README.md", *sorted(docs.glob("*.md")), *sorted(docs.glob("live/*.md"))]
     return found + sorted((ROOT / "stad_lab" / "pretrained").glob("*/README.md"))
 
 

@@ -37,6 +37,7 @@ from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controlle
 from stad_lab.models.controller import initial_parameters
 
 LIVE = Path(__file__).parent.parent / "docs" / "live"
+GAME = "```{include} race.md\n"  # how the story shows the game
 sys.path.insert(0, str(LIVE))
 import live_build  # noqa: E402
 
@@ -244,9 +245,10 @@ def live_pages(tmp_path_factory):
     folder = tmp_path_factory.mktemp("live")
     live_build.write_scripts(folder)
     for file in LIVE.glob("*.md"):
-        text = file.read_text(encoding="utf-8")
-        if body := re.search(r"```\{raw\} html\n(.*?)```", text, re.DOTALL):
+        text = file.read_text(encoding="utf-8").replace(GAME, (LIVE / "race.md").read_text("utf-8"))
+        if parts := re.findall(r"```\{raw\} html\n(.*?)```", text, re.DOTALL):
             head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>live</title>'
             style = '<link rel="stylesheet" href="live.css"><body>'
-            (folder / f"{file.stem}.html").write_text(head + style + body[1], encoding="utf-8")
+            body = "".join(parts)
+            (folder / f"{file.stem}.html").write_text(head + style + body, encoding="utf-8")
     return folder

@@ -17,8 +17,11 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import load_file, save
 
+from stad_lab.replication.study_claims import MARGIN
+
 HERE = Path(__file__).parent
 PRETRAINED = HERE.parents[1] / "stad_lab" / "pretrained"
+CLAIMS = HERE.parents[1] / "stad_lab" / "replication" / "data" / "claims.json"
 AGENTS = ("frame", "input", "output", "input_output", "cropped_input")
 # What a worker runs: a page that is opened from the disk cannot give it a file.
 WORKER = ("engine", "layers", "vae", "mdn_rnn", "random", "hand", "race_worker")
@@ -63,9 +66,20 @@ def engine() -> dict[str, object]:
     return {**packed, "facts": facts, "source": source}
 
 
+def study() -> dict[str, object]:
+    """The primary comparisons of study 1, for the figure of the story."""
+    comparisons = json.loads(CLAIMS.read_text(encoding="utf-8"))["study1"]["comparisons"]
+    rows = []
+    for features, name in (("z, h", "C sees z and h"), ("z", "C sees z alone")):
+        one = comparisons[f"{features}: input_output"]
+        pairs = {"interval": one["interval"], "pairs": one["by_seed"]}
+        rows.append({"name": name, "difference": one["difference"], **pairs})
+    return {"rows": rows, "margin": MARGIN}
+
+
 def data() -> dict[str, object]:
     """Everything that the pages may load: name -> JSON value, weights and pictures as base64."""
-    found: dict[str, object] = {"engine": engine()}
+    found: dict[str, object] = {"engine": engine(), "study": study()}
     for agent in AGENTS:
         folder = PRETRAINED / agent
         found[f"vae_{agent}"] = encoded(save(fold_decoder(load_file(folder / "vae.safetensors"))))

@@ -24,16 +24,9 @@ stad.start(async () => {
     const found = new Worker(url);
     found.addEventListener("message", ({ data }) => receive(data));
     found.addEventListener("error", (event) => stad.fail(new Error(event.message)));
-    const bytes = await Promise.all([code, tables].map(unpack));
+    const bytes = await Promise.all([code, tables].map(stad.unpack));
     found.postMessage({ type: "load", code: bytes[0], facts, tables: bytes[1] });
     return found;
-  }
-
-  /** Bytes of a gzip file in base64. */
-  async function unpack(base64) {
-    const packed = new Blob([await stad.decodeBase64(base64)]).stream();
-    const stream = packed.pipeThrough(new DecompressionStream("gzip"));
-    return new Uint8Array(await new Response(stream).arrayBuffer());
   }
 
   /** Give the worker the networks of an agent. */

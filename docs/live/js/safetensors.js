@@ -64,6 +64,13 @@ stad.data ??= {};
     return bytes;
   };
 
+  /** Bytes of a gzip file in base64. */
+  stad.unpack = async (base64) => {
+    const packed = new Blob([await stad.decodeBase64(base64)]).stream();
+    const stream = packed.pipeThrough(new DecompressionStream("gzip"));
+    return new Uint8Array(await new Response(stream).arrayBuffer());
+  };
+
   /**
    * The tensors of a safetensors file: a header in JSON, and then the numbers.
    * @param {Uint8Array} bytes

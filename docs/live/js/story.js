@@ -1,0 +1,132 @@
+"use strict";
+// What the figures of the story share. A figure is set up when it comes near, and only the one in
+// the middle of the window moves.
+globalThis.stad ??= {};
+
+{
+  const figures = new Map(); // element -> { run: (on) => void } once it is ready
+  let middle = null; // the element whose figure moves
+
+  /**
+   * Set up the figure `[data-figure=NAME]` when it comes near; its controls work from then on.
+   * @param {string} name
+   * @param {(part: (name: string) => HTMLElement) => Promise<{run?: (on: boolean) => void}>} make
+   *   is given a function that finds the figure's elements `[data-part=NAME]`
+   */
+  stad.figure = (name, make) => {
+    const root = document.querySelector(`[data-figure=${name}]`);
+    if (!root) return;
+    const part = (id) => root.querySelector(`[data-part=${id}]`);
+    const near = new IntersectionObserver(async ([seen]) => {
+      if (!seen.isIntersecting) return;
+      near.disconnect();
+      try {
+        figures.set(root, (await make(part)) ?? {});
+        root.querySelector("fieldset").disabled = false;
+        root.dataset.state = "ready";
+        part("message").hidden = true;
+        if (root === middle) setRunning(root, true);
+      } catch (error) {
+        part("message").textContent = `This figure does not work. ${error.message}`;
+        root.dataset.state = "failed";
+        console.error(error);
+      }
+    }, { rootMargin: "100% 0px" }); // prettier-ignore
+    near.observe(root);
+    central.observe(root);
+  };
+
+  function setRunning(root, on) {
+    figures.get(root)?.run?.(on && !document.hidden);
+  }
+
+  // A band in the middle of the window holds at most one figure for most of the time.
+  const central = new IntersectionObserver((seen) => {
+    for (const { target, isIntersecting } of seen) {
+      if (isIntersecting && middle !== target) {
+        setRunning(middle, false);
+        middle = target;
+        setRunning(middle, true);
+      } else if (!isIntersecting && middle === target) {
+        setRunning(middle, false);
+        middle = null;
+      }
+    }
+  }, { rootMargin: "-45% 0px -45% 0px" }); // prettier-ignore
+  document.addEventListener("visibilitychange", () => setRunning(middle, true));
+
+  /**
+   * Buttons for a bet: the first click counts, and shows which answer is right.
+   * @param {HTMLElement} box where they are put
+   * @param {string[]} names
+   * @param {(choice: number) => number} judge returns the number of the right answer
+   * @returns {() => void} allows another bet
+   */
+  stad.bet = (box, names, judge) => {
+    let done = false;
+    const buttons = names.map((name, number) => {
+      const button = document.createElement("button");
+      [button.type, button.textContent] = ["button", name];
+      button.addEventListener("click", () => {
+        if (done) return;
+        done = true;
+        const right = judge(number);
+        buttons.forEach((one, i) => {
+          one.setAttribute("aria-disabled", "true"); // not `disabled`: the focus stays
+          one.classList.toggle("right", i === right);
+          one.classList.toggle("wrong", i === number && i !== right);
+        });
+      });
+      return button;
+    });
+    box.replaceChildren(...buttons);
+    return () => {
+      done = false;
+      for (const one of buttons) {
+        one.removeAttribute("aria-disabled");
+        one.classList.remove("right", "wrong");
+      }
+    };
+  };
+
+  let engine = null;
+
+  /** The real CarRacing in this page's own thread, for a single car; loaded once. */
+  stad.loadEngine = () => {
+    engine ??= (async () => {
+      const { code, tables, facts } = await stad.load("engine");
+      const [module, rest] = await Promise.all([code, tables].map(stad.unpack));
+      return stad.Engine.make(module, facts, rest);
+    })();
+    return engine;
+  };
+
+  /** V, M and C of a shipped agent: its tensors, and an agent of the engine. */
+  stad.loadDriver = async (name) => {
+    const engine = await stad.loadEngine();
+    const names = [`vae_${name}`, `mdn_rnn_${name}`, `controller_${name}`];
+    const [vae, mdnRnn, c] = await Promise.all(names.map(stad.loadTensors));
+    const parameters = Float64Array.from(c.parameters.data);
+    return { vae, mdnRnn, parameters, agent: engine.makeAgent(vae, mdnRnn, parameters) };
+  };
+
+  /** Bytes of a frame as numbers in [0, 1]. */
+  stad.scaleFrame = (bytes) => Float32Array.from(bytes, (value) => value / 255);
+
+  /** A function from world units to pixels of a square map that holds all of these points. */
+  stad.projectMap = (points, width, margin = 14) => {
+    const [xs, ys] = [0, 1].map((axis) => points.map((point) => point[axis]));
+    const [left, right] = [Math.min(...xs), Math.max(...xs)];
+    const [low, high] = [Math.min(...ys), Math.max(...ys)];
+    const scale = (width - 2 * margin) / Math.max(right - left, high - low);
+    const place = ([x, y]) => [
+      width / 2 + (x - (left + right) / 2) * scale,
+      width / 2 - (y - (low + high) / 2) * scale,
+    ];
+    return { place, scale };
+  };
+
+  /** The middle of each tile of a track. */
+  stad.middleLine = (track) =>
+    Array.from({ length: track.count }, (_, i) => [track.path[4 * i + 2], track.path[4 * i + 3]]);
+}

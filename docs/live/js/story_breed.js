@@ -1,0 +1,91 @@
+"use strict";
+// "Breed a driver": the recorded run of a shipped agent, and a flag on its first lap.
+
+stad.figure("breed", async (part) => {
+  const [run, tensors] = await Promise.all([
+    stad.load("evolution"),
+    stad.loadTensors("evolution_tensors"),
+  ]);
+  const { generations } = run;
+  const [facts] = run.tracks;
+  const pairs = (data) =>
+    Array.from({ length: data.length / 2 }, (_, i) => [data[2 * i], data[2 * i + 1]]);
+  const [all, road] = [pairs(tensors["paths.0"].data), pairs(tensors["road.0"].data)];
+  let begin = 0;
+  const paths = facts.points.map((count) => all.slice(begin, (begin += count)));
+  const first = facts.laps.indexOf(true);
+  let [moment, planted, wanted] = [0, false, !stad.prefersStill()];
+  const STEPS = 5; // frames between two points of a path
+  const chosen = () => Number(part("flag").value);
+
+  const clock = new stad.Clock(
+    () => {
+      moment += 1;
+      if (moment > Math.max(...facts.points) + 30) moment = 0;
+    },
+    draw,
+    40, // points a second, four times as fast as the car
+  );
+
+  function draw() {
+    const cleared = stad.clearCanvas(part("map"));
+    if (!cleared) return;
+    const { context, width } = cleared;
+    const { place, scale } = stad.projectMap(road, width);
+    context.lineJoin = "round";
+    stad.strokeLine(context, [...road, road[0]].map(place), "#8a8a8a", 2 * run.half_width * scale);
+    const at = (i) => paths[i][Math.min(moment, paths[i].length - 1)];
+    for (let i = 0; i < paths.length; i++)
+      if (i !== chosen()) stad.fillDot(context, place(at(i)), 3.5, shade(i));
+    const driven = paths[chosen()].slice(0, moment + 1).map(place);
+    stad.strokeLine(context, driven, "#0072B2", 2);
+    stad.fillDot(context, place(at(chosen())), 8, "white");
+    stad.fillDot(context, place(at(chosen())), 6, "#0072B2");
+    part("time").textContent = `${Math.min(20, (moment * STEPS) / stad.FRAMES_A_SECOND).toFixed(0)} s`;
+  }
+
+  /** Pale for early generations, dark for late ones. */
+  const shade = (i) => `hsl(28 ${40 + (50 * i) / paths.length}% ${78 - (45 * i) / paths.length}%)`;
+
+  function show() {
+    const i = chosen();
+    part("flag-value").textContent = generations[i];
+    part("flag").setAttribute("aria-valuetext", `generation ${generations[i]}`);
+    const points = planted ? `, ${facts.returns[i].toFixed(0)} points` : "";
+    const lap = planted ? (facts.laps[i] ? ", a whole lap" : ", no whole lap") : "";
+    stad.describe(part("map"), `recorded drives of 25 generations; generation ${generations[i]}${points}${lap}`); // prettier-ignore
+    if (planted) part("summary").textContent = `Generation ${generations[i]}${points}${lap}.`;
+    draw();
+  }
+
+  part("flag").max = generations.length - 1;
+  part("flag").addEventListener("input", show);
+  part("plant").addEventListener("click", () => {
+    if (planted) return;
+    planted = true;
+    const guess = generations[chosen()];
+    const text = `You said ${guess}: the first whole lap on this track is in generation ${generations[first]}.`;
+    part("answer").textContent = text;
+    part("plant").setAttribute("aria-disabled", "true");
+    stad.announce(text);
+    moment = 0;
+    part("flag").value = first;
+    show();
+  });
+  const showPlay = () => (part("play").textContent = clock.running ? "Pause" : "Play");
+  part("play").addEventListener("click", () => {
+    wanted = !clock.running;
+    if (wanted) clock.play();
+    else clock.pause();
+    showPlay();
+  });
+  new ResizeObserver(draw).observe(part("map"));
+  show();
+  return {
+    run(on) {
+      if (on && wanted) clock.play();
+      else clock.pause();
+      showPlay();
+    },
+  };
+});

@@ -1,0 +1,228 @@
+"use strict";
+// "Close its eyes": three dreams branch off one drive. And who stays on the dreamed road longer?
+
+{
+  const NAME = "input_output";
+  const [TRACK, BEGIN] = [7, 80]; // on a straight before a bend
+  const SAME = 0.15; // share of pixels that show road in one picture only
+  const LASTING = 10; // frames in a row
+  const ROWS = 54; // above the indicator bar
+
+  const isRoad = (frame, p) => frame[p + 1] - frame[p] < 0.18; // grass is green
+  const inSeconds = (frames) => (frames / stad.FRAMES_A_SECOND).toFixed(1);
+
+  /** How much two pictures disagree on where the road is: a share of their pixels. */
+  function disagreement(first, second) {
+    let count = 0;
+    const end = 3 * ROWS * stad.FRAME_SIZE;
+    for (let p = 0; p < end; p += 3) count += Number(isRoad(first, p) !== isRoad(second, p));
+    return (3 * count) / end;
+  }
+
+  /** The driver, its V and M, and everything at the instant when the eyes close. */
+  async function loadInstant() {
+    const driver = await stad.loadDriver(NAME);
+    const engine = await stad.loadEngine();
+    const [car, { agent }] = [engine.makeCar(), driver];
+    const vae = new stad.VAE(driver.vae);
+    const mdnRnn = new stad.MDNRNN(driver.mdnRnn);
+    const track = engine.makeTrack(TRACK);
+    let instant = null;
+
+    /** Drive the real car up to the instant, and keep it there. */
+    async function approach() {
+      car.reset(track);
+      agent.reset();
+      await stad.inBackground(() => {
+        car.step(agent.act(car.frame()));
+        return car.frames < BEGIN;
+      });
+      agent.see(car.frame());
+      const [z, h, c] = [agent.z, agent.h, agent.c].map((one) => Float64Array.from(one));
+      instant = { z, h, c };
+    }
+
+    const dreamOf = (seed) => {
+      const { z, h, c } = instant;
+      return new stad.Dream(mdnRnn, z, { h, c }, new stad.Random(seed));
+    };
+    const act = (dream) => stad.control(driver.parameters, dream.z, dream.state.h);
+    return { car, agent, vae, approach, dreamOf, act };
+  }
+
+  stad.figure("dream", async (part) => {
+    const { car, agent, vae, approach, dreamOf, act } = await loadInstant();
+    const canvases = [1, 2, 3].map((i) => part(`dream-${i}`));
+    const BOUNDS = [50, 150]; // frames between the three answers
+    const LONGEST = 400; // frames of a dream
+    let [dreams, seed, wanted, over] = [[], 1, true, false];
+    let bet = null;
+
+    const clock = new stad.Clock(step, draw);
+
+    async function restart() {
+      clock.pause();
+      await approach();
+      dreams = canvases.map(() => ({ dream: dreamOf(seed++), apart: 0, parted: null }));
+      for (const { dream } of dreams) dream.temperature = Number(part("temperature").value);
+      over = false;
+      agent.remember(agent.control());
+      car.step(agent.control());
+      draw();
+    }
+
+    function step() {
+      for (const { dream } of dreams) dream.step(act(dream));
+      if (!car.over) car.step(agent.act(car.frame()));
+      if (dreams[0].dream.frames >= LONGEST || car.over) {
+        over = true;
+        clock.pause();
+      }
+    }
+
+    function draw() {
+      const real = stad.scaleFrame(car.frame());
+      stad.paintFrame(part("real"), real);
+      dreams.forEach((one, i) => {
+        const { frame } = vae.decode(Float32Array.from(one.dream.z));
+        stad.paintFrame(canvases[i], frame);
+        if (one.dream.frames === 0 || one.parted !== null) return;
+        one.apart = disagreement(frame, real) > SAME ? one.apart + 1 : 0;
+        if (one.apart >= LASTING) one.parted = Math.max(1, one.dream.frames - LASTING);
+      });
+      const told = dreams.map(({ parted }) => (parted === null ? "still together" : `parted after ${inSeconds(parted)} s`)); // prettier-ignore
+      told.forEach((text, i) => {
+        if (part(`told-${i + 1}`).textContent !== text) part(`told-${i + 1}`).textContent = text;
+      });
+      const time = inSeconds(dreams[0].dream.frames);
+      part("time").textContent = `${time} s with closed eyes`;
+      stad.describe(part("real"), `the real road, ${time} seconds after the eyes closed`);
+      canvases.forEach((canvas, i) => stad.describe(canvas, `dream ${i + 1}, ${told[i]}`));
+      if (bet && dreams.every(({ parted }) => parted !== null)) settle();
+    }
+
+    /** The bet is on the middle one of three dreams. */
+    function settle() {
+      const middle = dreams.map(({ parted }) => parted).sort((a, b) => a - b)[1];
+      const answer = BOUNDS.filter((bound) => middle > bound).length;
+      const text = `${bet.choice === answer ? "Right" : "No"}: the middle one of the three parted after ${inSeconds(middle)} seconds.`;
+      part("answer").textContent = text;
+      stad.announce(text);
+      bet = null;
+    }
+
+    const names = ["Within a second", "One to three seconds", "Later"];
+    const box = part("bets");
+    box.replaceChildren(
+      ...names.map((name, choice) => {
+        const button = document.createElement("button");
+        [button.type, button.textContent] = ["button", name];
+        button.addEventListener("click", async () => {
+          if (bet || part("answer").textContent) return;
+          bet = { choice };
+          button.setAttribute("aria-pressed", "true");
+          part("after").hidden = false;
+          await restart();
+          [wanted] = [true];
+          clock.play();
+        });
+        return button;
+      }),
+    );
+    part("again").addEventListener("click", async () => {
+      await restart();
+      [wanted] = [true];
+      clock.play();
+      showPlay();
+    });
+    const showPlay = () => (part("play").textContent = clock.running ? "Pause" : "Go on");
+    part("play").addEventListener("click", () => {
+      wanted = !clock.running;
+      if (wanted && !over) clock.play();
+      else clock.pause();
+      showPlay();
+    });
+    part("temperature").addEventListener("input", ({ target }) => {
+      part("temperature-value").textContent = Number(target.value).toFixed(1);
+      for (const { dream } of dreams) dream.temperature = Number(target.value);
+    });
+    await restart();
+    const begun = () => !part("after").hidden;
+    return {
+      run(on) {
+        if (on && wanted && begun() && !over) clock.play();
+        else clock.pause();
+        showPlay();
+      },
+    };
+  });
+
+  stad.figure("wheel", async (part) => {
+    const { vae, approach, dreamOf, act } = await loadInstant();
+    const LOST = 25; // frames in a row without a road under the car
+    const hand = new stad.Hand();
+    const best = { you: 0, agent: 0 };
+    let [dream, who, off, over, seed] = [null, null, 0, true, 1];
+    const clock = new stad.Clock(step, draw);
+    await approach();
+
+    function begin(driver) {
+      [dream, who, off, over] = [dreamOf(seed++), driver, 0, false];
+      hand.action.fill(0);
+      clock.play();
+      if (driver === "you") part("seat").focus({ preventScroll: true });
+    }
+
+    function step() {
+      dream.step(who === "you" ? hand.act() : act(dream));
+      if (dream.frames >= stad.LONGEST) finish();
+    }
+
+    function draw() {
+      const { frame } = vae.decode(Float32Array.from(dream.z));
+      stad.paintFrame(part("view"), frame);
+      if (over) return;
+      off = onRoad(frame) ? 0 : off + 1;
+      part("seconds").textContent = `${inSeconds(dream.frames)} s`;
+      if (off >= LOST) finish();
+    }
+
+    /** Whether some road lies just beside the car, which is drawn at the bottom middle. */
+    function onRoad(frame) {
+      let count = 0;
+      for (let y = 40; y < 52; y++)
+        for (let x = 26; x < 38; x++) count += Number(isRoad(frame, 3 * (64 * y + x)));
+      return count > 144 / 3;
+    }
+
+    function finish() {
+      over = true;
+      clock.pause();
+      const lasted = (dream.frames - (off >= LOST ? LOST : 0)) / stad.FRAMES_A_SECOND;
+      best[who] = Math.max(best[who], lasted);
+      part(`best-${who}`).textContent = `${best[who].toFixed(1)} s`;
+      const name = who === "you" ? "You" : "The hand (C)";
+      const text = off >= LOST ? `left the dreamed road after ${lasted.toFixed(1)} seconds.` : "stayed on it for 20 seconds."; // prettier-ignore
+      part("answer").textContent = `${name} ${text}`;
+      stad.announce(`${name} ${text}`);
+    }
+
+    part("you").addEventListener("click", () => begin("you"));
+    part("agent").addEventListener("click", () => begin("agent"));
+    const driving = () => !over && who === "you";
+    stad.listenToPedals(hand, part("seat"), () => over && begin("you"), driving);
+    part("seat").addEventListener("keydown", ({ key }) => {
+      if (key !== "Escape") return;
+      document.activeElement.blur();
+      if (!over) finish();
+    });
+    dream = dreamOf(seed);
+    draw();
+    return {
+      run(on) {
+        if (on && !over) clock.play();
+        else clock.pause();
+      },
+    };
+  });
+}

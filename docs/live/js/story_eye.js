@@ -1,0 +1,135 @@
+"use strict";
+// "32 numbers": what is left of a frame, three latents to move, and what information costs.
+
+stad.figure("eye", async (part) => {
+  const NAME = "input_output";
+  const [LOST, REACH] = [1, 4]; // the right answer; how far a slider goes
+  const [descriptions, { vae: tensors, agent }] = await Promise.all([
+    stad.load("latents"),
+    stad.loadDriver(NAME),
+  ]);
+  const vae = new stad.VAE(tensors);
+  const pictures = await drive();
+  let [place, z, guessed] = [0, null, false];
+
+  /** Frames of the agent's own drive on a track, with z of each. */
+  async function drive() {
+    const [TRACK, FIRST, EVERY, LAST] = [7, 90, 60, 480];
+    const engine = await stad.loadEngine();
+    const car = engine.makeCar();
+    const found = [];
+    car.reset(engine.makeTrack(TRACK));
+    agent.reset();
+    await stad.inBackground(() => {
+      const frame = car.frame();
+      car.step(agent.act(frame));
+      if (car.frames >= FIRST && car.frames % EVERY === 0)
+        found.push({ frame: stad.scaleFrame(frame), z: agent.z.slice() });
+      return car.frames < LAST && !car.over;
+    });
+    return found;
+  }
+
+  /** For each of three quantities the latent that follows it most. */
+  const chosen = ["road offset", "wheel angle", "yaw rate"].map((quantity) => {
+    const follows = ({ quantity: name, r }) => (name === quantity ? Math.abs(r) : 0);
+    const some = descriptions[NAME];
+    return some.reduce((best, one, i) => (follows(one) > follows(some[best]) ? i : best), 0);
+  });
+  const words = ["place on the road", "steering", "turning (yaw rate)"];
+  const sliders = chosen.map((latent, i) => {
+    const label = document.createElement("label");
+    label.className = "wide";
+    label.innerHTML = `<span>${words[i]}, <i>z</i>[${latent}]</span><input type="range">`;
+    const range = label.querySelector("input");
+    Object.assign(range, { min: -REACH, max: REACH, step: 0.05 });
+    range.addEventListener("input", () => {
+      z[latent] = Number(range.value);
+      decode();
+    });
+    part("sliders").append(label);
+    return range;
+  });
+
+  function take(number) {
+    place = number % pictures.length;
+    z = pictures[place].z.slice();
+    sliders.forEach((range, i) => (range.value = z[chosen[i]]));
+    stad.paintFrame(part("frame"), pictures[place].frame);
+    decode();
+  }
+
+  function decode() {
+    drawBars();
+    if (!guessed) return;
+    stad.paintFrame(part("decoded"), vae.decode(z).frame);
+    const moved = chosen.filter((latent) => z[latent] !== pictures[place].z[latent]).length;
+    stad.describe(part("decoded"), `decoded from 32 numbers, ${moved} of them moved`);
+  }
+
+  function drawBars() {
+    const cleared = stad.clearCanvas(part("bars"));
+    if (!cleared) return;
+    const { context, width, height } = cleared;
+    const step = width / z.length;
+    z.forEach((value, i) => {
+      const tall = Math.max(-1, Math.min(1, value / REACH)) * (height / 2 - 2);
+      context.fillStyle = chosen.includes(i) ? "#E69F00" : "#56B4E9";
+      context.fillRect(i * step + 1, height / 2, Math.max(1, step - 2), -tall || 1);
+    });
+  }
+
+  stad.bet(part("bets"), ["The bend", "The squares in the grass", "The edge of the road"], () => {
+    guessed = true;
+    part("veil").hidden = true;
+    part("after").hidden = false;
+    decode();
+    const text = "The squares are gone: leaving them out costs the least error for its 32 numbers.";
+    part("answer").textContent = text;
+    stad.announce(text);
+    return LOST;
+  });
+  part("another").addEventListener("click", () => take(place + 1));
+  part("back").addEventListener("click", () => take(place));
+  new ResizeObserver(() => z && drawBars()).observe(part("bars"));
+  take(0);
+
+  // The price of a nat, when its details are opened.
+  part("price").addEventListener(
+    "toggle",
+    async () => {
+      const { networks, frames } = await stad.load("nat");
+      const sheet = await stad.readPicture(await stad.load("nat_picture"));
+      const size = stad.FRAME_SIZE;
+      const cells = [0, 1].map((row) =>
+        Array.from({ length: frames }, (_, i) => {
+          const canvas = document.createElement("canvas");
+          [canvas.width, canvas.height, canvas.className] = [size, size, "pixels"];
+          canvas.setAttribute("role", "img");
+          canvas.setAttribute("aria-label", `frame ${i + 1}${row ? ", decoded" : ""}`);
+          part("strip").append(canvas);
+          return canvas;
+        }),
+      );
+      part("strip").style.gridTemplateColumns = `repeat(${frames}, minmax(0, 1fr))`;
+      const show = () => {
+        const one = networks[Number(part("weight").value)];
+        cells.forEach((line, row) =>
+          line.forEach((canvas, i) => {
+            const x = row ? (Number(part("weight").value) + 1) * size : 0;
+            const from = [x, 2 * i * size, size, size];
+            canvas.getContext("2d").drawImage(sheet.canvas, ...from, 0, 0, size, size);
+          }),
+        );
+        const used = one.kl_of_latents.filter((value) => value > 0.05).length;
+        const text = `KL weight ${one.kl_weight}: ${one.kl.toFixed(0)} nats, ${used} of 32 numbers in use.`;
+        part("spent").textContent = text;
+        part("weight").setAttribute("aria-valuetext", text);
+      };
+      part("weight").max = networks.length - 1;
+      part("weight").addEventListener("input", show);
+      show();
+    },
+    { once: true },
+  );
+});

@@ -1,0 +1,114 @@
+"use strict";
+// "Where it loses": the reader marks a place of the map, then the agent drives there, live.
+
+stad.figure("hairpin", async (part) => {
+  const [NAME, TRACK, FAST] = ["input", 19, 6]; // steps of the car for one of the clock
+  const [{ agent }, engine] = await Promise.all([stad.loadDriver(NAME), stad.loadEngine()]);
+  const [track, car] = [engine.makeTrack(TRACK), engine.makeCar()];
+  const line = stad.middleLine(track);
+  const WIDE = 20 / 3; // half the width of the road
+  let [mark, path, lost, over, begun] = [null, [], [], false, false];
+  car.reset(track);
+  agent.reset();
+
+  const clock = new stad.Clock(step, draw);
+
+  function nearest(x, y) {
+    const distances = line.map(([u, v]) => Math.hypot(u - x, v - y));
+    const least = Math.min(...distances);
+    return { tile: distances.indexOf(least), distance: least };
+  }
+
+  function step() {
+    for (let i = 0; i < FAST && !car.over; i++) {
+      car.step(agent.act(car.frame()));
+      const { x, y } = car.pose();
+      const { tile, distance } = nearest(x, y);
+      path.push([x, y]);
+      if (distance > 1.5 * WIDE) lost.push({ tile, frame: car.frames, at: [x, y] });
+    }
+    if (car.over) finish();
+  }
+
+  function finish() {
+    over = true;
+    clock.pause();
+    const tile = lost[0]?.tile;
+    const apart = tile === undefined ? Infinity : Math.abs(tile - mark);
+    const near = Math.min(apart, track.count - apart) < 20;
+    const text = tile === undefined
+      ? `It stayed on the road, with ${car.score.toFixed(0)} points.`
+      : `${near ? "You found it" : "It was elsewhere"}: it first left the road in the bend at tile ${tile}, after ${(lost[0].frame / 50).toFixed(1)} seconds. ${car.score.toFixed(0)} points.`; // prettier-ignore
+    part("answer").textContent = text;
+    stad.announce(text);
+    part("race").hidden = false;
+    draw();
+  }
+
+  function draw() {
+    const cleared = stad.clearCanvas(part("map"));
+    if (!cleared) return;
+    const { context, width } = cleared;
+    const { place, scale } = stad.projectMap(line, width);
+    context.lineJoin = "round";
+    stad.strokeLine(context, [...line, line[0]].map(place), "#8a8a8a", 2 * WIDE * scale);
+    stad.strokeLine(context, line.slice(0, 2).map(place), "white", 2 * WIDE * scale);
+    stad.strokeLine(context, path.map(place), "#0072B2", 2);
+    for (const { at } of lost) stad.fillDot(context, place(at), 3, "#D55E00");
+    if (mark !== null) {
+      const [x, y] = place(line[mark]);
+      stad.fillDot(context, [x, y], 9, "#E69F00");
+      context.fillStyle = "black";
+      context.textAlign = "center";
+      context.fillText("?", x, y + 4);
+    }
+    if (path.length) stad.fillDot(context, place(path.at(-1)), 6, "#0072B2");
+    const state = over ? part("answer").textContent : begun ? `${car.score.toFixed(0)} points` : "";
+    const marked = mark === null ? "no place is marked" : `your mark is at tile ${mark}`;
+    stad.describe(part("map"), `track 19 with ${track.count} tiles; ${marked}. ${state}`);
+  }
+
+  /** Put the mark on a tile, as long as the car has not started. */
+  function put(tile) {
+    if (begun) return;
+    mark = (tile + track.count) % track.count;
+    part("go").disabled = false;
+    draw();
+  }
+
+  part("map").addEventListener("click", ({ clientX, clientY }) => {
+    const { left, top, width } = part("map").getBoundingClientRect();
+    const { place } = stad.projectMap(line, width);
+    const distances = line.map((point) => {
+      const [x, y] = place(point);
+      return Math.hypot(x - (clientX - left), y - (clientY - top));
+    });
+    put(distances.indexOf(Math.min(...distances)));
+  });
+  part("map").addEventListener("keydown", (event) => {
+    const way = { ArrowLeft: -5, ArrowRight: 5 }[event.key];
+    if (!way) return;
+    event.preventDefault();
+    put((mark ?? 0) + way);
+    stad.announce(`The mark is at tile ${mark}.`);
+  });
+  part("go").addEventListener("click", () => {
+    if (over) {
+      [path, lost, over] = [[], [], false];
+      car.reset(track);
+      agent.reset();
+    }
+    begun = true;
+    if (clock.running) clock.pause();
+    else clock.play();
+    part("go").textContent = "Pause or go on";
+  });
+  new ResizeObserver(draw).observe(part("map"));
+  draw();
+  return {
+    run(on) {
+      if (on && begun && !over) clock.play();
+      else clock.pause();
+    },
+  };
+});
