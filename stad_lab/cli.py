@@ -527,6 +527,7 @@ def compete(
     check: Path | None = None,
     kit: Path | None = None,
     reveal: bool = False,
+    baselines: bool = True,
     processes: int = 2,
     limits: Limits = Limits(),  # noqa: B008
 ) -> int | None:
@@ -544,6 +545,7 @@ def compete(
         check: Try one submission on three public tracks, as its author would.
         kit: Write a first agent to this file, to begin from.
         reveal: Print seeds and salt on the leaderboard.
+        baselines: Whether the random driver, straight on, and the shipped agents stand beside.
         processes: Submissions that drive at once.
         limits: What a submission may use.
     """
@@ -559,7 +561,9 @@ def compete(
         return int(said.startswith("FAILED"))
     if not submissions or not secret:
         raise ValueError("expected a folder of submissions and --secret FILE, made by --commit")
-    print(f"written to {run.run(submissions, secret, output(out), limits, processes, reveal)}")
+    folder = output(out)
+    page = run.run(submissions, secret, folder, limits, processes, reveal, baselines)
+    print(f"written to {page}")
 
 
 COMMANDS: dict[str, Callable] = {

@@ -17,12 +17,14 @@ class Agent:
 def make_agent():
     {make}
     return Agent()
+
+{last}
 """
 # Name: (where the line stands, the line, a part of what its author reads).
 MISBEHAVE = {
     "crash": ("act", "if self.frame == 5: raise KeyError('speed')", "KeyError: 'speed' (crash.py"),
     "crash_at_import": ("top", "import no_such_module", "no_such_module"),
-    "no_make_agent": ("top", "make_agent = None", ""),
+    "no_make_agent": ("last", "del make_agent", "no function make_agent()"),
     "hang": ("act", "if self.frame == 5: time.sleep(3600)", "longer than the limit"),
     "hang_at_start": ("make", "while True: pass", "longer than the limit"),
     "nan": ("act", "if self.frame == 5: return [float('nan'), 0, 0]", "not finite"),
@@ -45,7 +47,7 @@ CHEATS = {
 
 def source(place: str, line: str) -> str:
     """The file of a submission with one line of its own."""
-    return AGENT.format(**{"act": "pass", "top": "", "make": "pass"} | {place: line})
+    return AGENT.format(**{"act": "pass", "top": "", "make": "pass", "last": ""} | {place: line})
 
 
 def write_class(folder, good: int, misbehaving=tuple(MISBEHAVE)) -> None:
