@@ -11,6 +11,7 @@ stad.start(async () => {
 
   let [track, state, before, arrived] = [null, null, null, 0];
   let [best, asleep, sleptAt] = [readBest(), false, null];
+  let seen = true; // whether enough of the picture is in the window
   let { seed, agent } = readAddress();
   const held = new Map();
   const worker = await startWorker();
@@ -86,7 +87,7 @@ stad.start(async () => {
 
   function draw() {
     requestAnimationFrame(draw);
-    if (!state || !track || document.hidden) return;
+    if (!state || !track || document.hidden || !seen) return;
     const cleared = stad.clearCanvas(get("race"));
     if (!cleared) return;
     const { context, width, height } = cleared;
@@ -115,6 +116,18 @@ stad.start(async () => {
     context.restore();
     drawMap(context, width, height, cars);
     drawSpeed(context, width, height, shown.speed);
+    if (touching && state.phase === "race") drawPads(context, width, height);
+  }
+
+  /** Where a finger steers. */
+  function drawPads(context, width, height) {
+    const steers = new Set(held.values());
+    context.font = "600 44px system-ui, sans-serif";
+    context.textAlign = "center";
+    for (const [side, x, sign] of [["left", 40, "\u25c0"], ["right", width - 40, "\u25b6"]]) {
+      context.fillStyle = steers.has(side) ? "#fff" : "#fff9";
+      context.fillText(sign, x, height / 2);
+    }
   }
 
   function drawGrass(context, { x, y }, wide) {
@@ -269,7 +282,7 @@ stad.start(async () => {
   }
 
   function showStart() {
-    showCard("Beat the agent", "It drives now. Press an arrow key, or touch the picture, to race it.");
+    showCard("Beat the agent", "Press an arrow key, or touch the picture, to race it.");
   }
 
   function showEnd() {
@@ -280,7 +293,7 @@ stad.start(async () => {
     const record = mine > (best[seed] ?? -Infinity);
     if (record) {
       best[seed] = mine;
-      localStorage.setItem("stad-race", JSON.stringify(best));
+      keepBest();
     }
     const text =
       `${ways[you.ending]} after ${seconds(you.frames)} s. You ${mine.toFixed(1)} points, ` +
@@ -288,6 +301,14 @@ stad.start(async () => {
       `${record ? ", just now" : ""}.`;
     showCard(title, text);
     stad.announce(`${title} ${text}`);
+  }
+
+  function keepBest() {
+    try {
+      localStorage.setItem("stad-race", JSON.stringify(best));
+    } catch {
+      // without storage nothing is kept
+    }
   }
 
   function readBest() {
@@ -307,14 +328,14 @@ stad.start(async () => {
     return { seed: found, agent: AGENTS.includes(wanted) ? wanted : "frame" };
   }
 
+  /** Note what the reader has chosen, so that the address shows this race to others, too. */
   function writeAddress() {
     history.replaceState(null, "", `#track=${seed}&agent=${agent}`);
-    set("seed", String(seed));
   }
 
   function drive(newSeed) {
     seed = newSeed;
-    writeAddress();
+    set("seed", String(seed));
     worker.postMessage({ type: "track", seed });
     worker.postMessage({ type: "begin", phase: "attract" });
   }
@@ -382,7 +403,8 @@ stad.start(async () => {
       return;
     }
     const racing = state?.phase === "race" || get("seat").contains(document.activeElement);
-    const idle = state?.phase === "attract" && document.activeElement === document.body;
+    const free = document.activeElement === document.body; // no other control wants the keys
+    const idle = state?.phase === "attract" && seen && free;
     if (!racing && !idle) return;
     if (event.key.toLowerCase() === "p" && !event.repeat)
       return setPaused(state.phase === "race");
@@ -407,18 +429,23 @@ stad.start(async () => {
   });
   document.addEventListener("visibilitychange", () => document.hidden && setPaused(true));
 
+  // Out of sight nothing drives, and who wants no motion sees a still picture until the race.
+  new IntersectionObserver(
+    ([{ isIntersecting }]) => {
+      seen = isIntersecting;
+      if (!seen) setPaused(true);
+      worker.postMessage({ type: "rest", on: !seen || stad.prefersStill() });
+    },
+    { threshold: 0.4 },
+  ).observe(get("race"));
+
   // Touch: the left and the right half of the picture steer.
   get("race").addEventListener("pointerdown", (event) => {
-    if (event.pointerType === "mouse" && state?.phase !== "attract") return;
+    if (event.pointerType === "mouse" || state?.phase !== "race") return; // a click begins
     event.preventDefault();
-    get("seat").focus({ preventScroll: true });
-    if (event.pointerType !== "mouse") {
-      touching = true;
-      const { left, width } = get("race").getBoundingClientRect();
-      held.set(event.pointerId, event.clientX < left + width / 2 ? "left" : "right");
-      get("race").setPointerCapture(event.pointerId);
-    }
-    wish();
+    const { left, width } = get("race").getBoundingClientRect();
+    held.set(event.pointerId, event.clientX < left + width / 2 ? "left" : "right");
+    get("race").setPointerCapture(event.pointerId);
     sendPedals();
   });
   for (const end of ["pointerup", "pointercancel", "lostpointercapture"])
@@ -435,9 +462,17 @@ stad.start(async () => {
     brake.addEventListener(end, press(false));
   setInterval(() => stad.readGamepad() && (wish(), sendPedals()), 40);
 
-  get("card").addEventListener("click", () => state?.phase === "attract" && begin());
+  for (const id of ["card", "race"])
+    get(id).addEventListener("click", ({ pointerType }) => {
+      touching = pointerType === "touch" || pointerType === "pen"; // then gas by itself
+      wish();
+      sendPedals();
+    });
   get("again").addEventListener("click", begin);
-  get("another").addEventListener("click", () => drive(Math.floor(Math.random() * 10000)));
+  get("another").addEventListener("click", () => {
+    drive(Math.floor(Math.random() * 10000));
+    writeAddress();
+  });
   get("pause").addEventListener("click", () => setPaused(state.phase === "race"));
   get("eyes").addEventListener("click", toggleEyes);
   get("auto").addEventListener("click", () =>
@@ -449,6 +484,7 @@ stad.start(async () => {
     choose(agent).catch(stad.fail);
   });
   get("share").addEventListener("click", async () => {
+    writeAddress();
     try {
       await navigator.clipboard.writeText(location.href);
       stad.announce("The link is copied.");
@@ -458,6 +494,7 @@ stad.start(async () => {
     }
   });
   addEventListener("hashchange", () => {
+    if (!location.hash.includes("track=")) return; // another place of the page
     const asked = readAddress();
     if (asked.agent !== agent) {
       agent = get("agent").value = asked.agent;
@@ -482,13 +519,7 @@ stad.start(async () => {
   }
 
   await choose(agent);
-  if (stad.prefersStill()) {
-    seed = readAddress().seed;
-    writeAddress();
-    worker.postMessage({ type: "track", seed });
-    worker.postMessage({ type: "begin", phase: "attract" });
-    worker.postMessage({ type: "begin", phase: "waiting" });
-  } else drive(seed);
+  drive(seed);
   await new Promise((done) => {
     const timer = setInterval(() => state && track && (clearInterval(timer), done()), 10);
   });

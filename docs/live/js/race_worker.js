@@ -52,6 +52,7 @@ stad.Race = class {
     this.random = new stad.Random(1);
     this.phase = "waiting"; // "attract": the agent drives alone; "race"; "paused"; "over"
     this.inset = true;
+    this.resting = false; // no car drives before the race while nobody sees it
     this.steps = 0;
   }
 
@@ -86,7 +87,8 @@ stad.Race = class {
 
   schedule() {
     clearTimeout(this.timer);
-    if (this.phase !== "attract" && this.phase !== "race") return;
+    const shown = this.phase === "attract" && !this.resting;
+    if (!shown && this.phase !== "race") return;
     this.timer = setTimeout(() => this.tick(), Math.max(0, this.due - performance.now()));
   }
 
@@ -155,6 +157,11 @@ stad.Race = class {
     this.schedule();
   }
 
+  rest(on) {
+    [this.resting, this.due] = [on, performance.now()];
+    this.schedule();
+  }
+
   closeEyes(closed) {
     if (this.you.frame || !closed) this.you.asleep = closed;
   }
@@ -171,6 +178,7 @@ if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScop
     track: ({ seed }) => race.setTrack(seed),
     begin: ({ phase }) => race.begin(phase),
     pause: ({ paused }) => race.pause(paused),
+    rest: ({ on }) => race.rest(on),
     eyes: ({ closed }) => race.closeEyes(closed),
     autopilot: ({ on }) => (race.you.autopilot = on),
     inset: ({ shown }) => (race.inset = shown),

@@ -1,0 +1,118 @@
+"""The game on the live pages, and the story's figures: played in a Chromium, from the disk."""
+
+import pytest
+
+SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
+
+
+@pytest.fixture
+def opened(browser, live_pages):
+    """A function that opens a page with an address when it is ready; no page may have an error."""
+    errors, contexts = [], []
+
+    def open_page(name, address="", **context):
+        contexts.append(browser.new_context(**context))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(SLOW)
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
+        page.goto((live_pages / f"{name}.html").as_uri() + address)
+        page.wait_for_selector("#live[data-state=ready]")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not errors
+
+
+def phase(page, wanted):
+    """Wait for a phase of the race."""
+    page.wait_for_selector(f"#live[data-phase={wanted}]")
+
+
+def test_a_race_begins_with_one_key_scores_pauses_and_goes_on(opened):
+    page = opened("race", reduced_motion="reduce")
+    phase(page, "attract")
+    page.keyboard.down("ArrowUp")
+    phase(page, "race")
+    page.wait_for_function("Number(document.querySelector('#your-score').textContent) > 20")
+    page.keyboard.press("p")
+    phase(page, "paused")
+    frames = page.evaluate("stad.page.state.you.frames")
+    page.wait_for_timeout(100)
+    assert page.evaluate("stad.page.state.you.frames") == frames
+    assert "Paused" in page.inner_text("#card")
+    page.keyboard.press("ArrowLeft")
+    phase(page, "race")
+    page.wait_for_function(f"stad.page.state.you.frames > {frames}")
+    page.evaluate("dispatchEvent(new Event('blur'))")
+    phase(page, "paused")
+
+
+def test_closed_eyes_show_the_dream_while_the_car_drives_on(opened):
+    page = opened("race")
+    page.keyboard.down("ArrowUp")
+    phase(page, "race")
+    page.wait_for_function("stad.page.state.you.frames > 20")
+    page.keyboard.press("e")
+    page.wait_for_selector("#dream:not([hidden])")
+    page.wait_for_function("stad.page.state.asleep && stad.page.state.you.frames > 40")
+    page.keyboard.press("e")
+    page.wait_for_selector("#dream", state="hidden")
+
+
+def test_the_address_leads_to_the_same_track_and_rival(opened):
+    first, second = (opened("race", "#track=19&agent=input") for _ in range(2))
+    paths = [page.evaluate("Array.from(stad.page.track.path)") for page in (first, second)]
+    assert paths[0] == paths[1]
+    assert first.input_value("#agent") == "input" and first.inner_text("#seed") == "19"
+    first.click("#another")
+    first.wait_for_function("stad.page.track.seed !== 19")
+    seed = first.evaluate("stad.page.track.seed")
+    assert first.evaluate("location.hash") == f"#track={seed}&agent=input"
+
+
+def test_a_finger_steers_with_gas_by_itself(opened):
+    page = opened("race", viewport={"width": 390, "height": 844}, has_touch=True)
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    page.tap("#race")
+    phase(page, "race")
+    page.wait_for_function("stad.page.state.you.pose.speed > 10")
+    assert abs(page.evaluate("stad.page.state.action[0]")) < 1e-6
+    box = page.locator("#race").bounding_box()
+    down = {"pointerType": "touch", "pointerId": 7, "bubbles": True, "isPrimary": True}
+    down |= {"clientX": box["x"] + 20, "clientY": box["y"] + 200}
+    page.evaluate("(on) => { race.setPointerCapture = () => {}; "
+                  "race.dispatchEvent(new PointerEvent('pointerdown', on)) }", down)  # fmt: skip
+    page.wait_for_function("stad.page.state.action[0] < -0.5")
+
+
+CLICK_ALL = "(one) => one.querySelectorAll('button').forEach((button) => button.click())"
+STORY = ("speed", "eye", "dream", "wheel", "breed", "study", "hairpin")
+
+
+def test_every_figure_of_the_story_works_when_it_comes_near_and_bears_impatient_clicks(opened):
+    page = opened("story", viewport={"width": 390, "height": 844})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
+    for name in STORY:
+        figure = page.locator(f"[data-figure={name}]")
+        figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
+        page.wait_for_selector(f"[data-figure={name}][data-state=ready]")
+        for _ in range(3):
+            figure.evaluate(CLICK_ALL)
+        page.wait_for_timeout(50)
+        assert figure.get_attribute("data-state") == "ready"
+
+
+def test_the_bend_that_the_agent_leaves_is_driven_live(opened):
+    page = opened("story", reduced_motion="reduce")
+    figure = page.locator("[data-figure=hairpin]")
+    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
+    page.wait_for_selector("[data-figure=hairpin][data-state=ready]")
+    marks = figure.locator("[data-part=map]")
+    for _ in range(10):
+        marks.press("ArrowLeft")
+    figure.locator("[data-part=go]").click()
+    page.wait_for_function("document.querySelector('[data-figure=hairpin] strong').textContent")
+    assert "689 points" in figure.locator("[data-part=answer]").inner_text()
