@@ -249,8 +249,14 @@ def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(r
     tells("You drive in the dream")
     page.get_by_role("button", name="the real track").click()
     tells("You drive on track 1")
+
+    def frame():
+        return int(re.search(r"frame (\d+)", status.first.inner_text())[1])
+
+    wait_for(lambda: frame() > 60, "frame 60", SLOW)
+    before = frame()
     page.keyboard.press("r")
-    tells("0.0 points")  # of the restarted episode's first moment, or of none
+    wait_for(lambda: frame() < before, "a restarted episode", SLOW)
     page.evaluate("window.dispatchEvent(new Event('blur'))")  # the reader turns to another window
     tells("paused")
     assert (
