@@ -88,6 +88,7 @@ napoleon_numpy_docstring = False
 html_theme = "furo"
 html_title = "stad_lab"
 html_static_path = [str(HERE / "_static")]
+html_search_scorer = str(HERE / "search_scorer.js")  # the reference comes last
 html_css_files = ["site.css"]
 html_js_files = ["site.js"]
 html_show_copyright = False

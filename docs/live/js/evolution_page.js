@@ -163,7 +163,7 @@ stad.start(async () => {
     const driven = generation * run.episodes;
     const text = `Generation ${generation}: ${points.toFixed(0)} points, ${end}.`;
     stad.get("summary").textContent =
-      `${text} ${driven.toLocaleString("en")} episodes were driven for it.`;
+      driven === 0 ? text : `${text} ${driven.toLocaleString("en")} episodes were driven for it.`;
     stad.announce(text);
     stad.describe(
       stad.get("track"),

@@ -14,14 +14,27 @@ stad.get = (id) => document.getElementById(id);
    * @param {() => Promise<void>} main
    */
   stad.start = async (main) => {
+    const controls = enclose();
     try {
       await main();
+      controls.disabled = controls.inert = false;
       stad.get("message").hidden = true;
       stad.get("live").dataset.state = "ready";
     } catch (error) {
       stad.fail(error);
     }
   };
+
+  /** Put all of the page into a fieldset, which takes no input yet. */
+  function enclose() {
+    const fieldset = document.createElement("fieldset");
+    fieldset.setAttribute("role", "presentation");
+    fieldset.disabled = fieldset.inert = true;
+    const parts = [...stad.get("live").children];
+    fieldset.append(...parts.filter(({ id }) => id !== "message" && id !== "news"));
+    stad.get("live").append(fieldset);
+    return fieldset;
+  }
 
   /** Show an error as a sentence. */
   stad.fail = (error) => {

@@ -188,13 +188,12 @@ stad.start(async () => {
     const side = Math.min(150, 0.3 * width);
     const [left, low, right, high] = track.box;
     const scale = (side - 16) / Math.max(right - left, high - low);
-    const place = ([x, y]) => [
-      width - side - 8 + 8 + (x - left) * scale,
-      8 + 8 + (high - y) * scale,
-    ];
+    const tall = (high - low) * scale + 16;
+    const top = width < 500 ? height - tall - 8 : 8; // on a phone the scores are above
+    const place = ([x, y]) => [width - side + (x - left) * scale, top + 8 + (high - y) * scale];
     context.fillStyle = "#fffd";
     context.beginPath();
-    context.roundRect(width - side - 8, 8, side, (high - low) * scale + 16, 8);
+    context.roundRect(width - side - 8, top, side, tall, 8);
     context.fill();
     stad.strokeLine(context, [...track.line, track.line[0]].map(place), "#777", 3);
     stad.fillDot(context, place([cars.rival.x, cars.rival.y]), 5, BLUE);

@@ -98,6 +98,7 @@ stad.start(async () => {
   }
 
   function showAll() {
+    if (!stad.get("all-three").open) return;
     for (const output of document.querySelectorAll("output.stride"))
       output.textContent = strides[stride];
     stad.get("stride").setAttribute("aria-valuetext", `${strides[stride]} frames`);
@@ -134,6 +135,7 @@ stad.start(async () => {
     nextRound();
     buttons[0].focus({ preventScroll: true });
   });
+  stad.get("all-three").addEventListener("toggle", showAll);
   stad.get("stride").addEventListener("input", (event) => {
     stride = Number(event.target.value);
     show();

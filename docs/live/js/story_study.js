@@ -3,7 +3,7 @@
 
 stad.figure("study", async (part) => {
   const { rows, margin } = await stad.load("study");
-  const [LOW, HIGH] = [-100, 130]; // points
+  const [LOW, HIGH] = [-115, 130]; // points
   let shown = false;
 
   function draw() {
@@ -36,7 +36,7 @@ stad.figure("study", async (part) => {
     shown = true;
     draw();
     const text = rows.map(({ name, difference, interval }) => `${name}: ${difference.toFixed(1)} points (95% interval ${interval.map((end) => end.toFixed(1)).join(" to ")})`).join(". "); // prettier-ignore
-    part("answer").textContent = "It depends on what the hand sees. Read on below the figure.";
+    part("answer").textContent = "No relevant gain was found. If the hand sees z alone, there is one: see below.";
     stad.describe(part("chart"), text);
     stad.announce(text);
     part("after").hidden = false;
