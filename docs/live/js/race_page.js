@@ -55,24 +55,32 @@ stad.start(async () => {
 
   // --- Drawing ------------------------------------------------------------------------------------
 
-  /** The road as paths: one for each shade, and the whole as a line for the map. */
+  const PIECE = 20; // tiles
+
+  /** The road in pieces, each as one path for each shade, and the whole as a line for the map. */
   function prepare(found) {
-    const shades = ["#666", "#696969", "#6b6b6b"].map((color) => ({ color, path: new Path2D() }));
-    const kerbs = ["#fff", "#e8342c"].map((color) => ({ color, path: new Path2D() }));
     const polygon = (path, corners, i) => {
       path.moveTo(corners[8 * i], corners[8 * i + 1]);
       for (let k = 1; k < 4; k++) path.lineTo(corners[8 * i + 2 * k], corners[8 * i + 2 * k + 1]);
       path.closePath();
     };
-    for (let i = 0; i < found.count; i++) polygon(shades[i % 3].path, found.tiles, i);
-    found.kerbTiles.forEach((tile, i) => polygon(kerbs[tile % 2].path, found.kerbs, i));
+    const colors = ["#666", "#696969", "#6b6b6b", "#fff", "#e8342c"]; // the last two are kerbs
+    const pieces = [];
+    for (let first = 0; first < found.count; first += PIECE) {
+      const middle = 4 * Math.min(first + PIECE / 2, found.count - 1);
+      const layers = colors.map((color) => ({ color, path: new Path2D() }));
+      pieces.push({ x: found.path[middle + 2], y: found.path[middle + 3], layers });
+    }
+    const layersOf = (tile) => pieces[Math.floor(tile / PIECE)].layers;
+    for (let i = 0; i < found.count; i++) polygon(layersOf(i)[i % 3].path, found.tiles, i);
+    found.kerbTiles.forEach((tile, i) => polygon(layersOf(tile)[3 + (tile % 2)].path, found.kerbs, i));
     const line = Array.from({ length: found.count }, (_, i) => [
       found.path[4 * i + 2],
       found.path[4 * i + 3],
     ]);
     const [xs, ys] = [line.map(([x]) => x), line.map(([, y]) => y)];
     const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
-    return { ...found, layers: [...shades, ...kerbs], line, box };
+    return { ...found, pieces, line, box };
   }
 
   /** A pose between the last two steps, so that the picture moves at the screen's rate. */
@@ -103,9 +111,13 @@ stad.start(async () => {
     context.rotate(-shown.angle);
     context.translate(-shown.x, -shown.y);
     drawGrass(context, shown, width / scale);
-    for (const { color, path } of track.layers) {
-      context.fillStyle = color;
-      context.fill(path);
+    const reach = Math.max(VIEW, width / scale) + 2 * PIECE; // a piece is less than 4 * PIECE long
+    for (const { x, y, layers } of track.pieces) {
+      if (Math.hypot(x - shown.x, y - shown.y) > reach) continue;
+      for (const { color, path } of layers) {
+        context.fillStyle = color;
+        context.fill(path);
+      }
     }
     drawStart(context);
     if (state.phase === "attract") drawCar(context, cars.rival, BLUE, 1);
