@@ -16,7 +16,6 @@ import numpy as np
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import FRAME_SIZE, FrameMemory, to_frame
-from stad_lab.features import encode_episode, features_of, remember_episode  # noqa: F401
 from stad_lab.inference import Inference
 from stad_lab.io.weights import (
     CONTROLLER_FILE,

@@ -252,3 +252,29 @@ def live_pages(tmp_path_factory):
             body = "".join(parts)
             (folder / f"{file.stem}.html").write_text(head + style + body, encoding="utf-8")
     return folder
+
+
+@pytest.fixture
+def opened(browser, live_pages):
+    """A function that opens a live page, at an address in it, and waits until it is ready.
+
+    No page may have an error, or ask a network; `loaded` has the addresses of all that it loads.
+    """
+    errors, contexts = [], []
+
+    def open_page(name, address="", **context):
+        contexts.append(browser.new_context(**context))
+        page = contexts[-1].new_page()
+        page.set_default_timeout(60_000)  # milliseconds: a busy machine is no fault
+        page.loaded = set()
+        page.on("pageerror", lambda error: errors.append(str(error)))
+        page.on("request", lambda one: page.loaded.add(one.url))
+        page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
+        page.goto((live_pages / f"{name}.html").as_uri() + address)
+        page.wait_for_selector("#live[data-state=ready]")
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not errors

@@ -12,20 +12,11 @@ import torch
 from safetensors.torch import save_file
 
 from stad_lab import Agent, load_agent, make_env
-from stad_lab.agent import (
-    PRETRAINED,
-    drive,
-    encode_episode,
-    features_of,
-    load_world_model,
-    remember_episode,
-    rollout,
-    run_folder,
-    shipped_agents,
-)
+from stad_lab.agent import PRETRAINED, drive, load_world_model, rollout, run_folder, shipped_agents
 from stad_lab.config import VARIANTS, Config
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import to_frame
+from stad_lab.features import encode_episode, features_of, remember_episode
 from stad_lab.io.weights import WorldModel, load_controller, load_vae, save_controller
 from stad_lab.models.controller import initial_parameters, parameter_count
 from stad_lab.models.mdn_rnn import MDNRNN

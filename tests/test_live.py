@@ -28,28 +28,6 @@ SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
 MEGABYTES = 6  # of a page, its scripts and its data
 
 
-@pytest.fixture
-def opened(browser, live_pages):
-    """A function that opens a page and waits until it is ready; no page may have an error."""
-    errors, contexts = [], []
-
-    def open_page(name, **context):
-        contexts.append(browser.new_context(**context))
-        page = contexts[-1].new_page()
-        page.set_default_timeout(SLOW)
-        page.loaded = set()
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("request", lambda request: page.loaded.add(request.url))
-        page.goto((live_pages / f"{name}.html").as_uri())
-        page.wait_for_selector("#live[data-state=ready]")
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert not errors
-
-
 def megabytes(page):
     """The size of all that a page has loaded; an AssertionError if it used a network."""
     loaded = [one for one in page.loaded if not one.startswith("data:")]

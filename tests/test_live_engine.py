@@ -22,12 +22,7 @@ PICTURED = (0, 1, 7, 60, 150)  # frames whose pictures are compared
 
 LOAD = """async () => {
     const { code, tables, facts } = await stad.load("engine")
-    const unpack = async (base64) => {
-        const packed = new Blob([await stad.decodeBase64(base64)]).stream()
-        const stream = packed.pipeThrough(new DecompressionStream("gzip"))
-        return new Uint8Array(await new Response(stream).arrayBuffer())
-    }
-    const [module, pictures] = [await unpack(code), await unpack(tables)]
+    const [module, pictures] = await Promise.all([code, tables].map(stad.unpack))
     globalThis.engine = await stad.Engine.make(module, facts, pictures)
     globalThis.car = engine.makeCar()
 }"""

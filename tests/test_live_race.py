@@ -1,30 +1,5 @@
 """The game on the live pages, and the story's figures: played in a Chromium, from the disk."""
 
-import pytest
-
-SLOW = 60_000  # milliseconds to wait for anything: a busy machine is no fault
-
-
-@pytest.fixture
-def opened(browser, live_pages):
-    """A function that opens a page with an address when it is ready; no page may have an error."""
-    errors, contexts = [], []
-
-    def open_page(name, address="", **context):
-        contexts.append(browser.new_context(**context))
-        page = contexts[-1].new_page()
-        page.set_default_timeout(SLOW)
-        page.on("pageerror", lambda error: errors.append(str(error)))
-        page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
-        page.goto((live_pages / f"{name}.html").as_uri() + address)
-        page.wait_for_selector("#live[data-state=ready]")
-        return page
-
-    yield open_page
-    for context in contexts:
-        context.close()
-    assert not errors
-
 
 def phase(page, wanted):
     """Wait for a phase of the race."""

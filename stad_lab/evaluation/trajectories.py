@@ -10,11 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from stad_lab.agent import Agent, Driver, encode_episode, remember_episode, rollout
+from stad_lab.agent import Agent, Driver, rollout
 from stad_lab.config import Config
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import episode_differences, to_frame
 from stad_lab.envs.state import MOTION, true_motion
+from stad_lab.features import encode_episode, remember_episode
 from stad_lab.io.weights import WorldModel
 from stad_lab.models.mdn_rnn import Mixture
 from stad_lab.models.vae import VAE, to_array, to_uint8

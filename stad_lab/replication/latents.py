@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from stad_lab.agent import PRETRAINED, load_agent, remember_episode, run_folder
+from stad_lab.agent import PRETRAINED, load_agent, run_folder
 from stad_lab.config import VARIANTS, Config, check_same, random_stream, track_seeds
 from stad_lab.envs.frames import earlier_frames
 from stad_lab.evaluation import metrics
@@ -33,6 +33,7 @@ from stad_lab.evaluation.trajectories import (
     record_trajectory,
     road_in_sight,
 )
+from stad_lab.features import remember_episode
 from stad_lab.io import weights
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.weights import WorldModel, load_world_model

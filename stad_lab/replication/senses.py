@@ -19,15 +19,7 @@ from stad_lab.models.controller import check_parameters, parameter_count
 
 ERASED = ("slip speed", "yaw rate", "wheel angle")  # the motion; columns of MOTION
 COLUMNS = [list(MOTION).index(name) for name in ERASED]
-SEES = {  # what C may see -> how it is told
-    "z": "z",
-    "z, h": "z and h",
-    "z + motion": "z and the car's true motion",
-    "z + placebo": "z and the motion of another episode",
-    "z + action": "z and the previous action",
-    "z - motion": "z without the motion",
-    "z - placebo": "z without three random directions",
-}
+SEES = ("z", "z, h", "z + motion", "z + placebo", "z + action", "z - motion", "z - placebo")
 DRAWS = 10_000  # triples of random directions, of which the nearest in variance is taken
 
 
@@ -103,7 +95,7 @@ class Sense:
     """A world model, and what C sees of it: `evolve` drives with it as with a world model."""
 
     world_model: WorldModel
-    sees: str  # a key of SEES
+    sees: str  # one of SEES
     eraser: Eraser | None = None
     scale: np.ndarray | None = None  # standard deviations of the three numbers beside z
     others: Sequence[np.ndarray] = ()  # motion (T, 3) of the episodes that the placebo shows

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from stad_lab.agent import encode_episode, load_agent, remember_episode, rollout
+from stad_lab.agent import load_agent, rollout
 from stad_lab.config import Config, random_stream, track_seeds
 from stad_lab.envs.cars import Cars
 from stad_lab.evaluation.probe import probe, split_episodes
 from stad_lab.evaluation.trajectories import Trajectory, encode_trajectory, road_in_sight
+from stad_lab.features import encode_episode, remember_episode
 from stad_lab.io.files import save_tensors
 from stad_lab.io.weights import WorldModel, check_belongs, load_kind
 from stad_lab.replication.latents import (

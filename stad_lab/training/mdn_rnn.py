@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from tqdm.auto import tqdm
 
-from stad_lab.agent import encode_episode
 from stad_lab.config import Config, check_same, random_stream
+from stad_lab.features import encode_episode
 from stad_lab.io import weights
 from stad_lab.io.files import locked
 from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_vae

@@ -13,9 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from stad_lab.agent import Agent, features_of, load_agent
+from stad_lab.agent import Agent, load_agent
 from stad_lab.config import Config, random_stream, track_seeds
 from stad_lab.envs.cars import Cars
+from stad_lab.features import features_of
 from stad_lab.io.files import checksum_of_arrays
 from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_controller, load_world_model
 from stad_lab.io.workers import single_thread, worker_threads

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from tqdm.auto import tqdm
 
-from stad_lab.agent import features_of
 from stad_lab.config import Config
+from stad_lab.features import features_of
 from stad_lab.io.files import save_tensors
 from stad_lab.io.weights import WorldModel, check_belongs, load_kind, load_world_model
 from stad_lab.models import controller

@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from stad_lab import make_env
-from stad_lab.agent import encode_episode, remember_episode
 from stad_lab.config import TRACK_RANGES, Config, track_seeds
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.track import TRACK_WIDTH
@@ -20,6 +19,7 @@ from stad_lab.evaluation.trajectories import (
     road_in_sight,
     true_motion,
 )
+from stad_lab.features import encode_episode, remember_episode
 from stad_lab.training.dataset import drive_randomly
 
 CONFIG = Config.preset("quick", seed=3, data={"random_starts": 1.0})

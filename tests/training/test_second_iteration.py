@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file
 
-from stad_lab.agent import features_of, load_agent
+from stad_lab.agent import load_agent
 from stad_lab.config import TRACK_RANGES, Config, track_seeds
 from stad_lab.envs.cars import Cars
 from stad_lab.evaluation.verify import verify
+from stad_lab.features import features_of
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.weights import load_controller, load_world_model, save_controller
 from stad_lab.training import pipeline, second_iteration

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from stad_lab.agent import features_of
 from stad_lab.config import Config
 from stad_lab.evaluation.verify import verify
+from stad_lab.features import features_of
 from stad_lab.io.files import load_json, save_tensors
 from stad_lab.io.weights import WorldModel, load_controller, load_world_model
 from stad_lab.models.controller import control, seen_columns

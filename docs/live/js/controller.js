@@ -13,11 +13,11 @@ globalThis.stad ??= {};
 stad.control = (parameters, z, h) => {
   const features = z.length + h.length;
   const raw = [0, 1, 2].map((output) => {
-    let sum = parameters[3 * features + output];
+    let sum = 0;
     const row = output * features;
     for (let i = 0; i < z.length; i++) sum += parameters[row + i] * z[i];
     for (let i = 0; i < h.length; i++) sum += parameters[row + z.length + i] * h[i];
-    return Math.tanh(sum);
+    return Math.tanh(sum + parameters[3 * features + output]);
   });
   return Float32Array.of(raw[0], (raw[1] + 1) / 2, Math.max(0, raw[2]));
 };

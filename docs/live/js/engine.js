@@ -590,17 +590,8 @@ stad.LONGEST = 1000; // frames of an episode
     }
 
     /** C's action for z and h: steering -1 to 1, gas and brake 0 to 1, float32. */
-    control(z = this.z, h = this.h) {
-      const { parameters } = this;
-      const width = parameters.length / 3 - 1;
-      const raw = [0, 1, 2].map((o) => {
-        let sum = 0;
-        for (let i = 0; i < z.length; i++) sum += parameters[o * width + i] * z[i];
-        for (let i = 0; i < width - z.length; i++)
-          sum += parameters[o * width + z.length + i] * h[i];
-        return Math.tanh(sum + parameters[3 * width + o]);
-      });
-      return Float32Array.of(raw[0], (raw[1] + 1) / 2, Math.min(1, Math.max(0, raw[2])));
+    control() {
+      return stad.control(this.parameters, this.z, this.h);
     }
 
     /** Update M's memory with z and an action. */

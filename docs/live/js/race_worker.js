@@ -51,7 +51,6 @@ stad.Race = class {
     this.hand = new stad.Hand();
     this.random = new stad.Random(1);
     this.phase = "waiting"; // "attract": the agent drives alone; "race"; "paused"; "over"
-    this.inset = true;
     this.resting = false; // no car drives before the race while nobody sees it
     this.steps = 0;
   }
@@ -63,7 +62,6 @@ stad.Race = class {
 
   /** The networks of an agent: it drives the ghost, and its V and M are also the reader's. */
   choose(networks) {
-    this.engine = this.engine ?? null;
     this.memoryTop ??= this.engine.memory.top;
     this.engine.memory.top = this.memoryTop; // the earlier cars and networks are forgotten
     [this.you, this.rival] = [0, 1].map(() => new stad.Racer(this.engine, networks));
@@ -110,8 +108,7 @@ stad.Race = class {
     if (this.phase !== "race") return;
     you.see(this.random);
     const action = you.autopilot ? undefined : this.hand.act();
-    this.action = you.drive(action);
-    this.hand.action.set(this.action);
+    this.hand.action.set(you.drive(action));
     if (you.car.over) this.finish();
   }
 
@@ -137,10 +134,10 @@ stad.Race = class {
       you: you.report(),
       rival: rival.report(),
       asleep: shown.asleep,
-      action: Array.from(this.phase === "attract" ? rival.agent.control() : this.hand.action),
+      action: Array.from(this.hand.action),
     };
     const often = you.asleep && this.phase === "race" ? 2 : 5; // steps
-    if (this.inset && shown.frame && (complete || this.steps % often === 0)) {
+    if (shown.frame && (complete || this.steps % often === 0)) {
       const decoded = this.vae.decode(shown.agent.z);
       const { past } = shown.agent;
       const earlier = past.length > stad.STRIDE ? past[0] : shown.frame;
@@ -181,7 +178,6 @@ if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScop
     rest: ({ on }) => race.rest(on),
     eyes: ({ closed }) => race.closeEyes(closed),
     autopilot: ({ on }) => (race.you.autopilot = on),
-    inset: ({ shown }) => (race.inset = shown),
     pedals: ({ held, gamepad }) => {
       race.hand.held = new Map(held.map((pedal, i) => [i, pedal]));
       race.hand.gamepad = gamepad;
