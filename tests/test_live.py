@@ -1,6 +1,5 @@
 """The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
 
-import copy
 import json
 import re
 import secrets
@@ -54,16 +53,15 @@ def rng():
     return np.random.default_rng(seed)
 
 
-def some_pictures(rng):
-    """A random frame of smooth shapes and a difference image: float32 (64, 64, 3)."""
-    coarse = rng.uniform(0, 1, (2, 8, 8, 3)).astype(np.float32)
-    frame, earlier = coarse.repeat(8, axis=1).repeat(8, axis=2)
-    return frame, frame - earlier
+def some_frames(rng):
+    """Two random frames of smooth shapes: uint8 (2, 64, 64, 3)."""
+    coarse = rng.integers(0, 256, (2, 8, 8, 3), np.uint8)
+    return coarse.repeat(8, axis=1).repeat(8, axis=2)
 
 
-V_IN_THE_PAGE = """async ([variant, frame, difference, z]) => {
+V_IN_THE_PAGE = """async ([variant, frame, earlier, z]) => {
     const vae = await stad.VAE.load(variant)
-    const pictures = [frame, difference].map((one) => Float32Array.from(one))
+    const pictures = [frame, earlier].map((one) => Uint8Array.from(one))
     const { mu, logvar } = vae.encode(...pictures)
     const decoded = vae.decode(Float32Array.from(z))
     return [mu, logvar, decoded.frame, decoded.difference].map((one) => one && Array.from(one))
@@ -74,11 +72,11 @@ def test_every_v_encodes_and_decodes_random_inputs_as_in_python(opened, rng):
     page = opened("latent", reduced_motion="reduce")
     for variant in VARIANTS:
         vae = load_agent(variant).vae
-        frame, difference = some_pictures(rng)
-        z = rng.normal(0, 1.5, 32).astype(np.float32)
-        inputs = [variant, *(one.ravel().tolist() for one in (frame, difference, z))]
+        frames, z = some_frames(rng), rng.normal(0, 1.5, 32).astype(np.float32)
+        inputs = [variant, *(one.ravel().tolist() for one in (*frames, z))]
         found = page.evaluate(V_IN_THE_PAGE, inputs)
-        pictures = (to_tensor(one[None]) for one in (frame, difference))
+        frame, earlier = frames / np.float32(255)
+        pictures = (to_tensor(one[None]) for one in (frame, frame - earlier))
         with torch.no_grad():
             mu, logvar = vae.encode(*pictures)
             decoded = vae.decode(torch.from_numpy(z)[None])
@@ -104,14 +102,15 @@ M_IN_THE_PAGE = """async ([latents, actions, parameters]) => {
 DREAM_IN_THE_PAGE = """([z, uniforms, normals, temperature]) => {
     const { mdnRnn, controller, vae } = stad.page
     const [uniform, normal] = [uniforms, normals].map((numbers) => () => numbers.shift())
-    const dream = new stad.Dream(
-        mdnRnn, Float64Array.from(z), mdnRnn.emptyState(), { uniform, normal })
+    const dream = new stad.Dream(mdnRnn, z, mdnRnn.emptyState(), { uniform, normal })
     dream.temperature = temperature
     const steps = []
     while (normals.length) {
+        const before = { z: dream.z, ...dream.state }
         const action = stad.control(controller, dream.z, dream.state.h)
         dream.step(action)
-        steps.push([...dream.z, ...action])
+        const step = { ...before, action, next: dream.z }
+        steps.push(Object.values(step).map((one) => Array.from(one)))
     }
     return [steps, Array.from(vae.decode(dream.z).frame)]
 }"""
@@ -143,41 +142,34 @@ def test_m_predicts_and_c_acts_as_in_python_over_200_steps(still_page, rng):
 
 
 @torch.no_grad()
-def dream_in_python(agent, z, temperature, rng, steps):
-    """A dream with C: z and action of every step, the last frame, and the random numbers used.
+def compare_dream(evaluate, rng, temperature, steps):
+    """Dream with C in the page; Python computes each step again, from the page's own state.
 
-    M is in double precision, as in the page: a dream amplifies the rounding of float32, in one of
-    ten to more than 1e-5. No uniform number is so close to a boundary between two Gaussians that
-    rounding could choose the other one.
+    From its own it would soon be elsewhere: a dream amplifies the rounding of each step.
     """
-    m, zeros = copy.deepcopy(agent.mdn_rnn).double(), torch.zeros(1, 1, 256, dtype=torch.float64)
-    state, rows, uniforms, normals = (zeros, zeros), [], [], []
-    for _ in range(steps):
-        action = control(agent.parameters, np.concatenate([z, state[0][0, 0].numpy()])[None])[0]
-        given = (torch.from_numpy(one)[None, None] for one in (z, action.astype(float)))
-        mixture, state = m(*given, state)
-        logpi, mean, logsigma = (part[0, 0] for part in mixture)
-        bounds = (logpi / temperature).softmax(-1).cumsum(-1).numpy()
-        uniform = rng.uniform(size=32)
-        while (close := np.abs(bounds - uniform[:, None]).min(axis=1) < 1e-4).any():
-            uniform[close] = rng.uniform(size=close.sum())
-        chosen = (uniform[:, None] > bounds[:, :-1]).sum(axis=1)
-        normal, row = rng.standard_normal(32), np.arange(32)
-        sigma = logsigma.exp().numpy()[row, chosen] * np.sqrt(temperature)
-        z = mean.numpy()[row, chosen] + sigma * normal
-        rows.append([*z, *action])
-        uniforms += uniform.tolist()
-        normals += normal.tolist()
-    return np.array(rows), agent.vae.decode(torch.tensor(z).float()[None])[0], uniforms, normals
+    agent, first = load_agent("input_output"), rng.standard_normal(32)
+    uniform, normal = rng.uniform(size=(steps, 32)), rng.standard_normal((steps, 32))
+    noise = [uniform.ravel().tolist(), normal.ravel().tolist()]
+    found, frame = evaluate(DREAM_IN_THE_PAGE, [first.tolist(), *noise, temperature])
+    z, h, c, action, following = (np.array(part, np.float32) for part in zip(*found, strict=True))
+    expected = control(agent.parameters, np.concatenate([z, h], axis=1))
+    np.testing.assert_allclose(action, expected, rtol=0, atol=CLOSE)
+    state = tuple(torch.from_numpy(one)[None] for one in (h, c))
+    given = (torch.from_numpy(one)[:, None] for one in (z, action))
+    logpi, mean, logsigma = (part[:, 0] for part in agent.mdn_rnn(*given, state)[0])
+    bounds = (logpi / temperature).softmax(-1).cumsum(-1).numpy()[..., :-1]
+    chosen = (uniform[..., None] > bounds).sum(axis=-1)[..., None]
+    sigma = np.exp(logsigma.numpy()) * np.sqrt(temperature)
+    mean, sigma = (np.take_along_axis(one, chosen, -1)[..., 0] for one in (mean.numpy(), sigma))
+    clear = np.abs(bounds - uniform[..., None]).min(axis=-1) > 1e-4  # rounding cannot choose
+    assert clear.mean() > 0.99
+    np.testing.assert_allclose(following[clear], (mean + sigma * normal)[clear], atol=CLOSE)
+    decoded = to_array(agent.vae.decode(torch.from_numpy(following[-1:]))[0]).ravel()
+    np.testing.assert_allclose(frame, decoded, rtol=0, atol=CLOSE)
 
 
 def test_a_dream_of_200_steps_with_the_same_noise_is_that_of_python(still_page, rng):
-    agent = load_agent("input_output")
-    z, temperature = rng.standard_normal(32), float(rng.uniform(0.3, 1.2))
-    rows, frame, *noise = dream_in_python(agent, z, temperature, rng, 200)
-    steps, decoded = still_page.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, temperature])
-    np.testing.assert_allclose(steps, rows, rtol=0, atol=CLOSE)
-    np.testing.assert_allclose(decoded, to_array(frame).ravel(), rtol=0, atol=CLOSE)
+    compare_dream(still_page.evaluate, rng, float(rng.uniform(0.3, 1.2)), 200)
 
 
 def test_held_keys_make_the_same_actions_as_in_the_package(still_page, rng):
@@ -349,16 +341,12 @@ PRESS_ALL = """() => {
 
 
 def test_firefox_opens_every_page_and_dreams_as_python(firefox, live_pages, rng):
-    agent = load_agent("input_output")
     for name in ("latent", "nat", "evolution", "speeds", "dream"):
         firefox.open((live_pages / f"{name}.html").as_uri())
         assert firefox.evaluate(READY) == ["ready", []]
         if name != "dream":
             assert firefox.evaluate(PRESS_ALL) == ["ready", []]
-    rows, frame, *noise = dream_in_python(agent, z := rng.standard_normal(32), 1.0, rng, 50)
-    steps, decoded = firefox.evaluate(DREAM_IN_THE_PAGE, [z.tolist(), *noise, 1.0])
-    np.testing.assert_allclose(steps, rows, rtol=0, atol=CLOSE)
-    np.testing.assert_allclose(decoded, to_array(frame).ravel(), rtol=0, atol=CLOSE)
+    compare_dream(firefox.evaluate, rng, 1.0, 50)
     state = "() => [stad.page.dream?.frames > 5, document.querySelector('#eyes').textContent]"
     firefox.evaluate("() => document.querySelector('#eyes').click()")
     deadline = time.monotonic() + SLOW / 1000

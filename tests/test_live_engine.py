@@ -44,7 +44,8 @@ DRIVE = """([seed, actions, pictured]) => {
 ACT = """async ([name, seed, frames]) => {
     const names = [`vae_${name}`, `mdn_rnn_${name}`, `controller_${name}`]
     const [vae, mdnRnn, c] = await Promise.all(names.map(stad.loadTensors))
-    const agent = engine.makeAgent(vae, mdnRnn, c.parameters.data, name.startsWith("cropped"))
+    const [v, m] = [new stad.VAE(engine, vae), new stad.MDNRNN(engine, mdnRnn)]
+    const agent = new stad.Agent(v, m, c.parameters.data, name.startsWith("cropped"))
     car.reset(engine.makeTrack(seed))
     const found = []
     while (found.length < frames && !car.over) {
@@ -63,7 +64,7 @@ def page(browser, live_pages):
     """A page with the engine and a car in it."""
     page = browser.new_page(reduced_motion="reduce")
     page.set_default_timeout(60_000)  # milliseconds: a busy machine is no fault
-    page.goto((live_pages / "race.html").as_uri())
+    page.goto((live_pages / "story.html").as_uri())
     page.wait_for_selector("#live[data-state=ready]")
     page.evaluate(LOAD)
     yield page

@@ -1,9 +1,5 @@
 import js from "@eslint/js";
-
-const browser =
-  "window document navigator location performance matchMedia getComputedStyle devicePixelRatio " +
-  "requestAnimationFrame setTimeout clearTimeout setInterval clearInterval addEventListener console atob URL Image Option " +
-  "MessageChannel MutationObserver ResizeObserver TextDecoder HTMLElement ImageData";
+import globals from "globals";
 
 export default [
   js.configs.recommended,
@@ -12,7 +8,8 @@ export default [
       sourceType: "script", // an ES module does not load from the disk
       globals: {
         stad: "writable",
-        ...Object.fromEntries(browser.split(" ").map((name) => [name, "readonly"])),
+        ...globals.browser,
+        ...globals.worker,
       },
     },
   },

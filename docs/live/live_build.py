@@ -24,7 +24,8 @@ PRETRAINED = HERE.parents[1] / "stad_lab" / "pretrained"
 CLAIMS = HERE.parents[1] / "stad_lab" / "replication" / "data" / "claims.json"
 AGENTS = ("frame", "input", "output", "input_output", "cropped_input")
 # What a worker runs: a page that is opened from the disk cannot give it a file.
-WORKER = ("engine", "controller", "layers", "vae", "mdn_rnn", "random", "hand", "race_worker")
+NETWORKS = ("layers", "vae", "mdn_rnn", "controller", "agent")
+WORKER = ("engine", *NETWORKS, "random", "hand", "race_worker")
 
 
 def fold_decoder(vae: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ stad.Dream = class {
   /**
    * @param {stad.MDNRNN} mdnRnn
    * @param {ArrayLike<number>} z the first one, for example that of a real frame
-   * @param {{h: Float64Array, c: Float64Array}} state M's memory of all frames before
+   * @param {{h: Float32Array, c: Float32Array}} state M's memory of all frames before
    * @param {{uniform: () => number, normal: () => number}} random
    */
   constructor(mdnRnn, z, state, random) {
@@ -43,7 +43,7 @@ stad.Memory = class {
   /** Encode the next frame, and remember it with its recorded action. */
   advance() {
     const t = this.length;
-    const { mu } = this.vae.encode(this.drive.frame(t), this.drive.difference(t));
+    const mu = this.vae.encodeMean(this.drive.bytes(t), this.drive.bytes(this.drive.earlier(t)));
     this.latents.push(mu);
     this.before.push(this.mdnRnn.remember(mu, this.drive.action(t), this.before[t]));
   }

@@ -138,7 +138,10 @@ stad.start(async () => {
     );
     if (!dream) return;
     const at = `after ${dream.frames} frames`;
-    stad.describe(get("distance"), `distance from the recorded episode ${at}: ${distance ?? "none"}`);
+    stad.describe(
+      get("distance"),
+      `distance from the recorded episode ${at}: ${distance ?? "none"}`,
+    );
     stad.describe(
       get("spread"),
       `spread of M's prediction ${at}: ${spreads.at(-1)?.[1].toFixed(2)}`,

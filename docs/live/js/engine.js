@@ -1,6 +1,6 @@
 "use strict";
-// The real CarRacing in this page: tracks, physics, pictures, V's encoder and M's memory.
-// All of it is compiled from stad_lab/envs and stad_lab/inference.py by wasm_build.py; here are only
+// The real CarRacing in this page: tracks, physics and pictures.
+// All of it is compiled from stad_lab/envs by wasm_build.py; here are only
 // the calls, what NumPy does for a seed, and the C library that the compiled code needs.
 // This script also runs in a worker, so it touches no document.
 globalThis.stad ??= {};
@@ -148,10 +148,9 @@ stad.LONGEST = 1000; // frames of an episode
 
   // --- The engine ---------------------------------------------------------------------------------
 
-  const [SIZES, FRAME] = [{ observation: 96, frame: 64 }, 64];
+  const SIZES = { observation: 96, frame: 64 };
   const [ROAD, WHITE, RED, GRASS, OUTSIDE] = [8, 12, 16, 4, 20]; // kinds of ground, as picture.py
   const [MOST_TILES, CHECKPOINTS, RADIUS] = [2500, 12, 150];
-  const TILE = 16; // outputs of a layer that are computed together, as inference.py
   const GROUND = [
     ["texels", (n) => n * n],
     ["quarter", (n) => (4 * n * n) / 16],
@@ -282,11 +281,6 @@ stad.LONGEST = 1000; // frames of an episode
     /** Memory for a car and its pictures, for many episodes. */
     makeCar() {
       return new stad.Car(this);
-    }
-
-    /** V's encoder, M's memory and C, from the tensors of their files. */
-    makeAgent(vae, mdnRnn, controller, cropBar = false) {
-      return new stad.Agent(this, vae, mdnRnn, controller, cropBar);
     }
   };
 
@@ -456,167 +450,5 @@ stad.LONGEST = 1000; // frames of an episode
       }
     }
     return { polygons, kinds };
-  };
-
-  // --- The agent ----------------------------------------------------------------------------------
-
-  /** Weights (inputs, outputs) and bias, filled up to whole tiles: `pack` of inference.py. */
-  function pack(inputs, outputs, at, bias) {
-    const tiles = Math.ceil(outputs / TILE);
-    const weights = new Float32Array(tiles * inputs * TILE);
-    for (let o = 0; o < outputs; o++)
-      for (let i = 0; i < inputs; i++)
-        weights[(Math.floor(o / TILE) * inputs + i) * TILE + (o % TILE)] = at(i, o);
-    const filled = new Float32Array(tiles * TILE);
-    filled.set(bias.subarray(0, outputs));
-    return { weights, bias: filled, inputs };
-  }
-
-  /** A convolution (outputs, inputs, kernel, kernel) whose input has `channels` channels. */
-  function packConvolution({ shape: [outputs, inputs, kernel], data }, bias, channels) {
-    const area = kernel * kernel;
-    const at = (i, o) => {
-      const [pixel, channel] = [Math.floor(i / channels), i % channels];
-      return channel < inputs ? data[(o * inputs + channel) * area + pixel] : 0;
-    };
-    return pack(area * channels, outputs, at, bias);
-  }
-
-  stad.Agent = class {
-    /**
-     * @param {stad.Engine} engine
-     * @param vae tensors of V; of the decoder nothing is used
-     * @param mdnRnn tensors of M, or null if C does not see h
-     * @param {Float64Array} parameters of C, for z and h, or for z alone
-     * @param {boolean} cropBar whether V sees frames without the indicator bar
-     */
-    constructor(engine, vae, mdnRnn, parameters, cropBar) {
-      Object.assign(this, { engine, memory: engine.memory, parameters, cropBar });
-      const { memory } = this;
-      this.channels = vae["encoder.0.weight"].shape[1];
-      this.layers = [];
-      let [size, channels] = [FRAME, this.channels];
-      for (const part of [0, 2, 4, 6]) {
-        const kernel = vae[`encoder.${part}.weight`].shape[2];
-        const bias = vae[`encoder.${part}.bias`].data;
-        const packed = packConvolution(vae[`encoder.${part}.weight`], bias, channels);
-        const side = Math.floor((size - kernel) / 2) + 1;
-        const starts = new BigInt64Array(side * side);
-        for (let p = 0; p < starts.length; p++)
-          starts[p] = BigInt((2 * Math.floor(p / side) * size + 2 * (p % side)) * channels);
-        const runs = [kernel, size * channels, kernel * channels];
-        this.layers.push(this.keep(starts, runs, packed, 0));
-        [size, channels] = [side, packed.bias.length];
-      }
-      const { shape, data } = vae["encoder.9.weight"];
-      this.latentSize = shape[0] / 2; // the other half is the logarithm of the variance
-      const last = { shape: [this.latentSize, shape[1] / (size * size), size], data };
-      const packed = packConvolution(last, vae["encoder.9.bias"].data, channels);
-      const dense = [1, 0, packed.inputs];
-      this.layers.push(this.keep(new BigInt64Array(1), dense, packed, -Infinity));
-      const largest = Math.max(...this.layers.map((one) => one.patches * one.outputs));
-      this.places = [memory.take(4 * largest), memory.take(4 * largest)];
-      this.pictures = memory.take(4 * FRAME * FRAME * this.channels);
-      this.frames = [memory.take(3 * FRAME * FRAME), memory.take(3 * FRAME * FRAME)];
-      if (mdnRnn) this.keepMemory(mdnRnn);
-      else this.hiddenSize = 0;
-      this.reset();
-    }
-
-    /** Copy a layer into the module's memory. */
-    keep(starts, [rows, row, run], { weights, bias }, floor) {
-      const { memory } = this;
-      const places = [memory.put(starts), memory.put(weights), memory.put(bias)];
-      const [patches, outputs] = [starts.length, bias.length];
-      return {
-        patches,
-        outputs,
-        arguments: [
-          places[0],
-          ...[patches, rows, row, run].map(BigInt),
-          places[1],
-          places[2],
-          BigInt(outputs),
-          floor,
-        ],
-      };
-    }
-
-    /** M's LSTM: both of its matrices as one, for z, the action and h side by side. */
-    keepMemory(tensors) {
-      const [input, hidden] = [tensors["lstm.weight_ih_l0"], tensors["lstm.weight_hh_l0"]];
-      const [seen, size] = [input.shape[1], hidden.shape[1]];
-      const at = (i, o) =>
-        i < seen ? input.data[o * seen + i] : hidden.data[o * size + (i - seen)];
-      const [first, second] = ["lstm.bias_ih_l0", "lstm.bias_hh_l0"].map((n) => tensors[n].data);
-      const bias = first.map((value, i) => Math.fround(value + second[i]));
-      const packed = pack(seen + size, 4 * size, at, bias);
-      this.lstm = this.keep(new BigInt64Array(1), [1, 0, packed.inputs], packed, -Infinity);
-      this.hiddenSize = size;
-      this.seen = this.memory.take(4 * packed.inputs);
-      this.gates = this.memory.take(4 * packed.bias.length);
-      this.state = this.memory.take(8 * size);
-    }
-
-    /** Forget the past: every episode begins with this. */
-    reset() {
-      [this.past, this.z] = [[], new Float32Array(this.latentSize)];
-      this.h = new Float32Array(this.hiddenSize);
-      this.c = new Float32Array(this.hiddenSize);
-    }
-
-    /** V's mean of z for a frame and the one before it, 64 x 64 x 3 bytes each. */
-    encode(frame, earlier) {
-      const { engine, memory } = this;
-      memory.write(this.frames[0], frame);
-      memory.write(this.frames[1], earlier);
-      engine.call("see", ...this.frames, this.pictures, BigInt(this.channels));
-      let [x, inputs] = [this.pictures, FRAME * FRAME * this.channels];
-      this.layers.forEach((layer, i) => {
-        const y = this.places[i % 2];
-        engine.call("layer", x, BigInt(inputs), ...layer.arguments, y);
-        [x, inputs] = [y, layer.patches * layer.outputs];
-      });
-      return memory.read(Float32Array, x, this.latentSize).slice();
-    }
-
-    /** Encode what the car sees; the difference image is to the frame `stride` before. */
-    see(frame, stride = 4) {
-      this.past.push(frame);
-      if (this.past.length > stride + 1) this.past.shift();
-      const earlier = this.past.length > stride ? this.past[0] : frame;
-      this.z = this.encode(frame, earlier);
-      return this.z;
-    }
-
-    /** C's action for z and h: steering -1 to 1, gas and brake 0 to 1, float32. */
-    control() {
-      return stad.control(this.parameters, this.z, this.h);
-    }
-
-    /** Update M's memory with z and an action. */
-    remember(action, z = this.z) {
-      if (!this.hiddenSize) return;
-      const { engine, memory } = this;
-      const seen = memory.read(Float32Array, this.seen, z.length + 3 + this.hiddenSize);
-      seen.set(z);
-      seen.set(action, z.length);
-      seen.set(this.h, z.length + 3);
-      const state = memory.read(Float32Array, this.state, 2 * this.hiddenSize);
-      state.set(this.h);
-      state.set(this.c, this.hiddenSize);
-      const places = [this.seen, this.gates, this.state, BigInt(this.hiddenSize)];
-      engine.call("remember", ...this.lstm.arguments, ...places);
-      const after = memory.read(Float32Array, this.state, 2 * this.hiddenSize).slice();
-      [this.h, this.c] = [after.slice(0, this.hiddenSize), after.slice(this.hiddenSize)];
-    }
-
-    /** One frame: encode, decide, remember; the action. */
-    act(frame) {
-      this.see(frame);
-      const action = this.control();
-      this.remember(action);
-      return action;
-    }
   };
 }

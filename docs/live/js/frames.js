@@ -2,8 +2,11 @@
 // Frames, difference images and recorded episodes. As stad_lab/envs/frames.py.
 globalThis.stad ??= {};
 
-stad.FRAME_SIZE = 64; // pixels, width and height of a frame
-stad.STRIDE = 4; // k of the shipped V: frames between the two pictures of a difference image
+stad.FRAME_SIZE ??= 64; // pixels, width and height of a frame
+stad.STRIDE ??= 4; // k of the shipped V: frames between the two pictures of a difference image
+
+/** Bytes of a frame as numbers in [0, 1]. */
+stad.scaleFrame = (bytes) => Float32Array.from(bytes, (value) => value / 255);
 
 /** d = frame - earlier, for frames in [0, 1]. */
 stad.differenceImage = (frame, earlier) => frame.map((value, i) => value - earlier[i]);
@@ -47,23 +50,33 @@ stad.Drive = class {
     this.kept = new Map();
   }
 
-  /** Frame t in [0, 1], 64 x 64 x 3. */
-  frame(t) {
+  /** Frame t as bytes, 64 x 64 x 3. */
+  bytes(t) {
     if (!this.kept.has(t)) {
       const [x, y] = [t % this.columns, Math.floor(t / this.columns)];
       const size = stad.FRAME_SIZE;
       const { data } = this.sheet.getImageData(x * size, y * size, size, size);
-      const frame = new Float32Array(3 * size * size);
+      const frame = new Uint8Array(3 * size * size);
       for (let p = 0, q = 0; p < frame.length; p += 3, q += 4)
-        for (let c = 0; c < 3; c++) frame[p + c] = data[q + c] / 255;
+        for (let c = 0; c < 3; c++) frame[p + c] = data[q + c];
       this.kept.set(t, frame);
     }
     return this.kept.get(t);
   }
 
-  /** The difference image of frame t; 0 in the first frames, which have no earlier one. */
-  difference(t, stride = stad.STRIDE) {
-    return stad.differenceImage(this.frame(t), this.frame(t >= stride ? t - stride : t));
+  /** Frame t in [0, 1], 64 x 64 x 3. */
+  frame(t) {
+    return stad.scaleFrame(this.bytes(t));
+  }
+
+  /** The frame from which the difference image of frame t is taken: in the first ones, itself. */
+  earlier(t) {
+    return t >= stad.STRIDE ? t - stad.STRIDE : t;
+  }
+
+  /** The difference image of frame t, in [-1, 1]. */
+  difference(t) {
+    return stad.differenceImage(this.frame(t), this.frame(this.earlier(t)));
   }
 
   /** The recorded action on frame t. */

@@ -112,7 +112,7 @@ stad.start(async () => {
 
   /** Encode the present frame, and take its z. */
   function encode() {
-    const { mu } = vae.encode(drive.frame(t), drive.difference(t));
+    const { mu } = vae.encode(drive.bytes(t), drive.bytes(drive.earlier(t)));
     vae.mu = mu;
     take(mu);
     stad.paintFrame(get("frame"), drive.frame(t));

@@ -1,97 +1,68 @@
 "use strict";
-// The layers of V and M. Pictures are flat Float32Arrays, rows x columns x channels: the numbers of
-// one pixel lie side by side, so that the inner loops are long and read memory in order.
+// The layers of V and M. All but the decoder's convolutions run in the compiled engine, as
+// `run_layer` of stad_lab/inference.py. Pictures are flat, rows x columns x channels: the numbers of
+// one pixel lie side by side. This script also runs in a worker, so it touches no document.
 globalThis.stad ??= {};
 
-/**
- * y = W x + b, as torch.nn.Linear.
- * @param {{shape: number[], data: Float32Array}} weight of shape (outputs, inputs)
- * @param {{data: Float32Array}} bias
- * @param Numbers kind of array for y
- * @returns {(x: Float32Array) => Float32Array}
- */
-stad.linear = (
-  { shape: [outputs, inputs], data: weight },
-  { data: bias },
-  Numbers = Float32Array,
-) => {
-  return (x) => {
-    const y = new Numbers(outputs);
-    for (let o = 0; o < outputs; o++) {
-      const row = o * inputs;
-      let sum = bias[o]; // four sums, because the processor adds in parallel
-      let sum1 = 0;
-      let sum2 = 0;
-      let sum3 = 0;
-      let i = 0;
-      for (; i + 3 < inputs; i += 4) {
-        sum += x[i] * weight[row + i];
-        sum1 += x[i + 1] * weight[row + i + 1];
-        sum2 += x[i + 2] * weight[row + i + 2];
-        sum3 += x[i + 3] * weight[row + i + 3];
-      }
-      for (; i < inputs; i++) sum += x[i] * weight[row + i];
-      y[o] = sum + sum1 + sum2 + sum3;
+{
+  const TILE = 16; // outputs of a layer that are computed together, as inference.py
+
+  /** Weights (inputs, outputs) and bias, filled up to whole tiles: `pack` of inference.py. */
+  function pack(inputs, outputs, at, bias) {
+    const tiles = Math.ceil(outputs / TILE);
+    const weights = new Float32Array(tiles * inputs * TILE);
+    for (let o = 0; o < outputs; o++)
+      for (let i = 0; i < inputs; i++)
+        weights[(Math.floor(o / TILE) * inputs + i) * TILE + (o % TILE)] = at(i, o);
+    const filled = new Float32Array(tiles * TILE);
+    filled.set(bias);
+    return { weights, bias: filled };
+  }
+
+  /** A layer in the engine's memory: each patch of its input makes `outputs` numbers. */
+  class Layer {
+    constructor(engine, starts, [rows, row, run], { weights, bias }, floor) {
+      const { memory } = engine;
+      [this.engine, this.patches, this.outputs] = [engine, starts.length, bias.length];
+      const places = [memory.put(starts), memory.put(weights), memory.put(bias)];
+      const sizes = [this.patches, rows, row, run].map(BigInt);
+      this.arguments = [places[0], ...sizes, places[1], places[2], BigInt(this.outputs), floor];
     }
-    return y;
-  };
-};
 
-/** max(0, x), in place. */
-stad.relu = (x) => {
-  for (let i = 0; i < x.length; i++) if (x[i] < 0) x[i] = 0;
-  return x;
-};
-
-/** Weights of shape (outer, inner, kernel, kernel) as (outer, kernel, kernel, inner). */
-stad.channelsLast = (data, outer, inner, kernel) => {
-  const area = kernel * kernel;
-  const found = new Float32Array(data.length);
-  for (let o = 0; o < outer; o++)
-    for (let i = 0; i < inner; i++)
-      for (let k = 0; k < area; k++)
-        found[(o * area + k) * inner + i] = data[(o * inner + i) * area + k];
-  return found;
-};
-
-/**
- * A convolution of stride 2 without padding, as torch.nn.Conv2d.
- * @param {{shape: number[], data: Float32Array}} weight of shape (outputs, inputs, kernel, kernel)
- * @param {{data: Float32Array}} bias
- * @returns {(x: Float32Array, size: number) => Float32Array} for a picture of size x size pixels
- */
-stad.convolution = ({ shape: [outputs, inputs, kernel], data }, { data: bias }) => {
-  const run = kernel * inputs; // a row of the kernel: neighbours in x, and so in the weights
-  const weight = stad.channelsLast(data, outputs, inputs, kernel);
-  const dot = stad.dotRows(weight, run, kernel);
-  return (x, size) => {
-    const side = Math.floor((size - kernel) / 2) + 1;
-    const y = new Float32Array(side * side * outputs);
-    for (let row = 0, place = 0; row < side; row++)
-      for (let column = 0; column < side; column++) {
-        const corner = (2 * row * size + 2 * column) * inputs;
-        for (let o = 0; o < outputs; o++)
-          y[place++] = bias[o] + dot(x, corner, size * inputs, o * kernel * run);
-      }
-    return y;
-  };
-};
-
-/** The sum of products of a kernel with the pixels below it; `run` is a multiple of 4. */
-stad.dotRows = (weight, run, rows) => (x, corner, line, start) => {
-  let sum = 0; // `let [a, b] = [0, 0]` would halve the speed
-  let sum1 = 0;
-  let sum2 = 0;
-  let sum3 = 0;
-  for (let row = 0, w = start; row < rows; row++)
-    for (let p = corner + row * line, end = p + run; p < end; p += 4, w += 4) {
-      sum += x[p] * weight[w];
-      sum1 += x[p + 1] * weight[w + 1];
-      sum2 += x[p + 2] * weight[w + 2];
-      sum3 += x[p + 3] * weight[w + 3];
+    /** Read `inputs` numbers at the address x, and write the outputs to y. */
+    run(x, inputs, y) {
+      this.engine.call("layer", x, BigInt(inputs), ...this.arguments, y);
     }
-  return sum + sum1 + sum2 + sum3;
-};
+  }
+
+  /**
+   * y = max(floor, W x + b), as torch.nn.Linear.
+   * @param {(i: number, o: number) => number} at the weight from input i to output o
+   */
+  stad.denseLayer = (engine, [inputs, outputs], at, bias, floor = -Infinity) =>
+    new Layer(engine, new BigInt64Array(1), [1, 0, inputs], pack(inputs, outputs, at, bias), floor);
+
+  /**
+   * A convolution of stride 2 without padding and a ReLU, as torch.nn.Conv2d.
+   * @param {{shape: number[], data: Float32Array}} weight of shape (outputs, inputs, kernel, kernel)
+   * @param {{data: Float32Array}} bias
+   * @param {number} size width and height of its input, in pixels
+   * @param {number} channels of its input: those beyond `inputs` are filled up
+   */
+  stad.convolution = (engine, weight, bias, size, channels) => {
+    const { shape: [outputs, inputs, kernel], data } = weight; // prettier-ignore
+    const [area, side] = [kernel * kernel, Math.floor((size - kernel) / 2) + 1];
+    const at = (i, o) => {
+      const [pixel, channel] = [Math.floor(i / channels), i % channels];
+      return channel < inputs ? data[(o * inputs + channel) * area + pixel] : 0;
+    };
+    const starts = new BigInt64Array(side * side);
+    for (let p = 0; p < starts.length; p++)
+      starts[p] = BigInt((2 * Math.floor(p / side) * size + 2 * (p % side)) * channels);
+    const packed = pack(area * channels, outputs, at, bias.data);
+    return new Layer(engine, starts, [kernel, size * channels, kernel * channels], packed, 0);
+  };
+}
 
 /**
  * A transposed convolution of stride 2, as torch.nn.ConvTranspose2d: each pixel of the input adds
@@ -101,8 +72,12 @@ stad.dotRows = (weight, run, rows) => (x, corner, line, start) => {
  * @returns {(x: Float32Array, size: number) => Float32Array} for a picture of size x size pixels
  */
 stad.transposedConvolution = ({ shape: [inputs, outputs, kernel], data }, { data: bias }) => {
-  const run = kernel * outputs;
-  const weight = stad.channelsLast(data, inputs, outputs, kernel);
+  const [run, area] = [kernel * outputs, kernel * kernel];
+  const weight = new Float32Array(data.length); // channels last
+  for (let i = 0; i < inputs; i++)
+    for (let o = 0; o < outputs; o++)
+      for (let k = 0; k < area; k++)
+        weight[(i * area + k) * outputs + o] = data[(i * outputs + o) * area + k];
 
   return (x, size) => {
     const side = 2 * (size - 1) + kernel;

@@ -1,11 +1,11 @@
 "use strict";
 // M, the MDN-RNN: an LSTM that predicts the next z as a mixture of Gaussians.
-// The same as stad_lab/models/mdn_rnn.py, with its weights, for one car and one step. It computes in
-// double precision: a dream feeds M with its own output, which amplifies every rounding.
+// The same as stad_lab/models/mdn_rnn.py, with its weights, for one car and one step. Its layers run
+// in the compiled engine. This script also runs in a worker, so it touches no document.
 globalThis.stad ??= {};
 
 stad.Mixture = class {
-  /** @param {Float64Array} output of M's head: logits, means and logsigmas, (latents, mixtures) */
+  /** @param {Float32Array} output of M's head: logits, means and logsigmas, (latents, mixtures) */
   constructor(output, latents, mixtures) {
     const size = latents * mixtures;
     this.latents = latents;
@@ -58,54 +58,69 @@ stad.Mixture = class {
 };
 
 stad.MDNRNN = class {
-  /** @param tensors of `data/mdn_rnn_VARIANT.js`, see stad.loadTensors */
-  constructor(tensors) {
-    this.hiddenSize = tensors["lstm.weight_hh_l0"].shape[1];
-    this.latentSize = tensors["lstm.weight_ih_l0"].shape[1] - 3; // beside the action
+  /**
+   * @param {stad.Engine} engine
+   * @param tensors of `data/mdn_rnn_VARIANT.js`, see stad.loadTensors
+   */
+  constructor(engine, tensors) {
+    const { memory } = engine;
+    const [input, hidden] = [tensors["lstm.weight_ih_l0"], tensors["lstm.weight_hh_l0"]];
+    const [seen, size] = [input.shape[1], hidden.shape[1]];
+    [this.engine, this.memory, this.hiddenSize] = [engine, memory, size];
+    this.latentSize = seen - 3; // beside the action
     this.mixtures = tensors["head.weight"].shape[0] / (3 * this.latentSize);
-    const at = (weight, bias) => stad.linear(tensors[weight], tensors[bias], Float64Array);
-    this.fromInput = at("lstm.weight_ih_l0", "lstm.bias_ih_l0");
-    this.fromHidden = at("lstm.weight_hh_l0", "lstm.bias_hh_l0");
-    this.head = at("head.weight", "head.bias");
+    // Both matrices of the LSTM as one, for z, the action and h side by side.
+    const weight = (i, o) =>
+      i < seen ? input.data[o * seen + i] : hidden.data[o * size + (i - seen)];
+    const [first, second] = ["lstm.bias_ih_l0", "lstm.bias_hh_l0"].map((n) => tensors[n].data);
+    const bias = first.map((value, i) => Math.fround(value + second[i]));
+    this.lstm = stad.denseLayer(engine, [seen + size, 4 * size], weight, bias);
+    const { shape, data } = tensors["head.weight"];
+    const at = (i, o) => data[o * size + i];
+    this.head = stad.denseLayer(engine, [size, shape[0]], at, tensors["head.bias"].data);
+    this.seen = memory.take(4 * (seen + size));
+    this.gates = memory.take(4 * Math.max(this.lstm.outputs, this.head.outputs));
+    this.state = memory.take(8 * size);
   }
 
   /** The memory at the start of an episode. */
   emptyState() {
-    return { h: new Float64Array(this.hiddenSize), c: new Float64Array(this.hiddenSize) };
+    return { h: new Float32Array(this.hiddenSize), c: new Float32Array(this.hiddenSize) };
   }
 
   /**
-   * One step of the LSTM. The gates i, f, g and o decide what enters the memory c, what stays in
-   * it, what the new content is, and what h shows of it.
+   * One step of the LSTM.
    * @param {ArrayLike<number>} z
    * @param {ArrayLike<number>} action steering, gas and brake
-   * @param {{h: Float64Array, c: Float64Array}} state is not changed
+   * @param {{h: Float32Array, c: Float32Array}} state is not changed
    */
-  remember(z, action, state) {
-    const size = this.hiddenSize;
-    const input = new Float64Array(z.length + action.length);
-    input.set(z);
-    input.set(action, z.length);
-    const [x, y] = [this.fromInput(input), this.fromHidden(state.h)];
-    const next = this.emptyState();
-    for (let j = 0; j < size; j++) {
-      const enter = stad.sigmoid(x[j] + y[j]);
-      const stay = stad.sigmoid(x[size + j] + y[size + j]);
-      const content = Math.tanh(x[2 * size + j] + y[2 * size + j]);
-      const show = stad.sigmoid(x[3 * size + j] + y[3 * size + j]);
-      next.c[j] = stay * state.c[j] + enter * content;
-      next.h[j] = show * Math.tanh(next.c[j]);
-    }
-    return next;
+  remember(z, action, { h, c }) {
+    const { engine, memory, hiddenSize: size } = this;
+    const seen = memory.read(Float32Array, this.seen, z.length + 3 + size);
+    seen.set(z);
+    seen.set(action, z.length);
+    seen.set(h, z.length + 3);
+    const state = memory.read(Float32Array, this.state, 2 * size);
+    state.set(h);
+    state.set(c, size);
+    const places = [this.seen, this.gates, this.state, BigInt(size)];
+    engine.call("remember", ...this.lstm.arguments, ...places);
+    const next = memory.read(Float32Array, this.state, 2 * size).slice();
+    return { h: next.slice(0, size), c: next.slice(size) };
   }
 
   /** The predicted mixture for the next z, from the memory h. */
   mixture(h) {
-    return new stad.Mixture(this.head(h), this.latentSize, this.mixtures);
+    const { memory, latentSize, mixtures } = this;
+    memory.read(Float32Array, this.seen, h.length).set(h);
+    this.head.run(this.seen, h.length, this.gates);
+    const output = memory.read(Float32Array, this.gates, 3 * latentSize * mixtures).slice();
+    return new stad.Mixture(output, latentSize, mixtures);
   }
 
   /** Load a shipped M: "frame", "input", "output" or "input_output". */
   static async load(variant) {
-    return new stad.MDNRNN(await stad.loadTensors(`mdn_rnn_${variant}`));
+    const parts = [stad.loadEngine(), stad.loadTensors(`mdn_rnn_${variant}`)];
+    return new stad.MDNRNN(...(await Promise.all(parts)));
   }
 };

@@ -36,7 +36,7 @@ stad.start(async () => {
     const [vae, mdnRnn, c] = await Promise.all(names.map(stad.loadTensors));
     if (name !== agent) return; // another one was chosen meanwhile
     const controller = Float64Array.from(c.parameters.data);
-    const networks = { vae, mdnRnn, controller, decoder: vae, cropBar: name.startsWith("cropped") };
+    const networks = { vae, mdnRnn, controller, cropBar: name.startsWith("cropped") };
     worker.postMessage({ type: "choose", networks });
   }
 
@@ -73,7 +73,9 @@ stad.start(async () => {
     }
     const layersOf = (tile) => pieces[Math.floor(tile / PIECE)].layers;
     for (let i = 0; i < found.count; i++) polygon(layersOf(i)[i % 3].path, found.tiles, i);
-    found.kerbTiles.forEach((tile, i) => polygon(layersOf(tile)[3 + (tile % 2)].path, found.kerbs, i));
+    found.kerbTiles.forEach((tile, i) =>
+      polygon(layersOf(tile)[3 + (tile % 2)].path, found.kerbs, i),
+    );
     const line = Array.from({ length: found.count }, (_, i) => [
       found.path[4 * i + 2],
       found.path[4 * i + 3],
@@ -136,7 +138,10 @@ stad.start(async () => {
     const steers = new Set(held.values());
     context.font = "600 44px system-ui, sans-serif";
     context.textAlign = "center";
-    for (const [side, x, sign] of [["left", 40, "\u25c0"], ["right", width - 40, "\u25b6"]]) {
+    for (const [side, x, sign] of [
+      ["left", 40, "\u25c0"],
+      ["right", width - 40, "\u25b6"],
+    ]) {
       context.fillStyle = steers.has(side) ? "#fff" : "#fff9";
       context.fillText(sign, x, height / 2);
     }
@@ -209,7 +214,8 @@ stad.start(async () => {
     context.fill();
     stad.strokeLine(context, [...track.line, track.line[0]].map(place), "#777", 3);
     stad.fillDot(context, place([cars.rival.x, cars.rival.y]), 5, BLUE);
-    if (state.phase !== "attract") stad.fillDot(context, place([cars.you.x, cars.you.y]), 5, ORANGE);
+    if (state.phase !== "attract")
+      stad.fillDot(context, place([cars.you.x, cars.you.y]), 5, ORANGE);
   }
 
   function drawSpeed(context, width, height, speed) {
@@ -417,8 +423,7 @@ stad.start(async () => {
     const free = document.activeElement === document.body; // no other control wants the keys
     const idle = state?.phase === "attract" && seen && free;
     if (!racing && !idle) return;
-    if (event.key.toLowerCase() === "p" && !event.repeat)
-      return setPaused(state.phase === "race");
+    if (event.key.toLowerCase() === "p" && !event.repeat) return setPaused(state.phase === "race");
     if (event.key.toLowerCase() === "e" && !event.repeat) return toggleEyes();
     const pedal = KEYS[event.code];
     if (!pedal) return;

@@ -6,13 +6,10 @@ stad.Racer = class {
   /**
    * One car and its driver's eyes and memory.
    * @param {stad.Engine} engine
-   * @param {object} networks tensors of V, M and C, see `load` below
+   * @param {stad.Agent} agent
    */
-  constructor(engine, networks) {
-    this.car = engine.makeCar();
-    const { vae, mdnRnn, controller, cropBar } = networks;
-    this.agent = engine.makeAgent(vae, mdnRnn, controller, cropBar);
-    this.mixture = new stad.MDNRNN(mdnRnn);
+  constructor(engine, agent) {
+    [this.car, this.agent] = [engine.makeCar(), agent];
   }
 
   reset(track) {
@@ -24,7 +21,8 @@ stad.Racer = class {
   /** What the driver sees next: z of the true frame, or of the dream while the eyes are closed. */
   see(random) {
     if (this.asleep) {
-      this.agent.z = Float32Array.from(this.mixture.mixture(this.agent.h).sample(1, random));
+      const { mdnRnn, h } = this.agent;
+      this.agent.z = Float32Array.from(mdnRnn.mixture(h).sample(1, random));
       return;
     }
     this.frame = this.car.frame(this.agent.cropBar);
@@ -60,12 +58,15 @@ stad.Race = class {
     this.post({ type: "loaded" });
   }
 
-  /** The networks of an agent: it drives the ghost, and its V and M are also the reader's. */
+  /** The tensors of an agent's networks: it drives the ghost, and its V and M are also the reader's. */
   choose(networks) {
     this.memoryTop ??= this.engine.memory.top;
     this.engine.memory.top = this.memoryTop; // the earlier cars and networks are forgotten
-    [this.you, this.rival] = [0, 1].map(() => new stad.Racer(this.engine, networks));
-    this.vae = new stad.VAE(networks.decoder);
+    const { engine } = this;
+    this.vae = new stad.VAE(engine, networks.vae);
+    const mdnRnn = new stad.MDNRNN(engine, networks.mdnRnn);
+    const driver = () => new stad.Agent(this.vae, mdnRnn, networks.controller, networks.cropBar);
+    [this.you, this.rival] = [0, 1].map(() => new stad.Racer(engine, driver()));
     if (this.track) this.begin(this.phase === "race" ? "attract" : this.phase);
   }
 
@@ -148,7 +149,8 @@ stad.Race = class {
 
   pause(paused) {
     if (paused && this.phase === "race") this.phase = "paused";
-    else if (!paused && this.phase === "paused") [this.phase, this.due] = ["race", performance.now()];
+    else if (!paused && this.phase === "paused")
+      [this.phase, this.due] = ["race", performance.now()];
     else return;
     this.tell(false);
     this.schedule();
@@ -163,9 +165,6 @@ stad.Race = class {
     if (this.you.frame || !closed) this.you.asleep = closed;
   }
 };
-
-stad.STRIDE ??= 4; // k of the shipped V
-stad.FRAME_SIZE ??= 64;
 
 if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScope) {
   const race = new stad.Race((message) => postMessage(message));

@@ -116,4 +116,16 @@ stad.data ??= {};
     await stad.pause();
     return tensors;
   };
+
+  let engine = null;
+
+  /** The compiled engine in this page's own thread, loaded once. */
+  stad.loadEngine = () => {
+    engine ??= (async () => {
+      const { code, tables, facts } = await stad.load("engine");
+      const [module, rest] = await Promise.all([code, tables].map(stad.unpack));
+      return stad.Engine.make(module, facts, rest);
+    })();
+    return engine;
+  };
 }

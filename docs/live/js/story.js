@@ -89,29 +89,18 @@ globalThis.stad ??= {};
     };
   };
 
-  let engine = null;
+  const drivers = new Map();
 
-  /** The real CarRacing in this page's own thread, for a single car; loaded once. */
-  stad.loadEngine = () => {
-    engine ??= (async () => {
-      const { code, tables, facts } = await stad.load("engine");
-      const [module, rest] = await Promise.all([code, tables].map(stad.unpack));
-      return stad.Engine.make(module, facts, rest);
-    })();
-    return engine;
-  };
-
-  /** V, M and C of a shipped agent: its tensors, and an agent of the engine. */
+  /** A shipped agent in this page's own thread; its V and M are loaded once. */
   stad.loadDriver = async (name) => {
-    const engine = await stad.loadEngine();
-    const names = [`vae_${name}`, `mdn_rnn_${name}`, `controller_${name}`];
-    const [vae, mdnRnn, c] = await Promise.all(names.map(stad.loadTensors));
-    const parameters = Float64Array.from(c.parameters.data);
-    return { vae, mdnRnn, parameters, agent: engine.makeAgent(vae, mdnRnn, parameters) };
+    if (!drivers.has(name))
+      drivers.set(
+        name,
+        Promise.all([stad.VAE.load(name), stad.MDNRNN.load(name), stad.loadController(name)]),
+      );
+    const [vae, mdnRnn, parameters] = await drivers.get(name);
+    return new stad.Agent(vae, mdnRnn, Float64Array.from(parameters));
   };
-
-  /** Bytes of a frame as numbers in [0, 1]. */
-  stad.scaleFrame = (bytes) => Float32Array.from(bytes, (value) => value / 255);
 
   /** A function from world units to pixels of a square map that holds all of these points. */
   stad.projectMap = (points, width, margin = 14) => {

@@ -41,7 +41,8 @@ stad.figure("breed", async (part) => {
     stad.strokeLine(context, driven, "#0072B2", 2);
     stad.fillDot(context, place(at(chosen())), 8, "white");
     stad.fillDot(context, place(at(chosen())), 6, "#0072B2");
-    part("time").textContent = `${Math.min(20, (moment * STEPS) / stad.FRAMES_A_SECOND).toFixed(0)} s`;
+    part("time").textContent =
+      `${Math.min(20, (moment * STEPS) / stad.FRAMES_A_SECOND).toFixed(0)} s`;
   }
 
   /** Pale for early generations, dark for late ones. */

@@ -21,11 +21,8 @@
 
   /** The driver, its V and M, and everything at the instant when the eyes close. */
   async function loadInstant() {
-    const driver = await stad.loadDriver(NAME);
-    const engine = await stad.loadEngine();
-    const [car, { agent }] = [engine.makeCar(), driver];
-    const vae = new stad.VAE(driver.vae);
-    const mdnRnn = new stad.MDNRNN(driver.mdnRnn);
+    const [agent, engine] = await Promise.all([stad.loadDriver(NAME), stad.loadEngine()]);
+    const [car, { vae, mdnRnn }] = [engine.makeCar(), agent];
     const track = engine.makeTrack(TRACK);
     let instant = null;
 
@@ -38,15 +35,12 @@
         return car.frames < BEGIN;
       });
       agent.see(car.frame());
-      const [z, h, c] = [agent.z, agent.h, agent.c].map((one) => Float64Array.from(one));
-      instant = { z, h, c };
+      instant = { z: agent.z, state: agent.state };
     }
 
-    const dreamOf = (seed) => {
-      const { z, h, c } = instant;
-      return new stad.Dream(mdnRnn, z, { h, c }, new stad.Random(seed));
-    };
-    const act = (dream) => stad.control(driver.parameters, dream.z, dream.state.h);
+    const dreamOf = (seed) =>
+      new stad.Dream(mdnRnn, instant.z, instant.state, new stad.Random(seed));
+    const act = (dream) => stad.control(agent.parameters, dream.z, dream.state.h);
     return { car, agent, vae, approach, dreamOf, act };
   }
 
@@ -84,7 +78,7 @@
       const real = stad.scaleFrame(car.frame());
       stad.paintFrame(part("real"), real);
       dreams.forEach((one, i) => {
-        const { frame } = vae.decode(Float32Array.from(one.dream.z));
+        const { frame } = vae.decode(one.dream.z);
         stad.paintFrame(canvases[i], frame);
         if (one.dream.frames === 0 || one.parted !== null) return;
         one.apart = disagreement(frame, real) > SAME ? one.apart + 1 : 0;
@@ -179,7 +173,7 @@
     }
 
     function draw() {
-      const { frame } = vae.decode(Float32Array.from(dream.z));
+      const { frame } = vae.decode(dream.z);
       stad.paintFrame(part("view"), frame);
       if (over) return;
       off = onRoad(frame) ? 0 : off + 1;

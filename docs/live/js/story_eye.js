@@ -4,11 +4,8 @@
 stad.figure("eye", async (part) => {
   const NAME = "input_output";
   const [LOST, REACH] = [1, 4]; // the right answer; how far a slider goes
-  const [descriptions, { vae: tensors, agent }] = await Promise.all([
-    stad.load("latents"),
-    stad.loadDriver(NAME),
-  ]);
-  const vae = new stad.VAE(tensors);
+  const [descriptions, agent] = await Promise.all([stad.load("latents"), stad.loadDriver(NAME)]);
+  const { vae } = agent;
   const pictures = await drive();
   let [place, z, guessed] = [0, null, false];
 

@@ -3,7 +3,7 @@
 
 stad.figure("hairpin", async (part) => {
   const [NAME, TRACK, FAST] = ["input", 19, 6]; // steps of the car for one of the clock
-  const [{ agent }, engine] = await Promise.all([stad.loadDriver(NAME), stad.loadEngine()]);
+  const [agent, engine] = await Promise.all([stad.loadDriver(NAME), stad.loadEngine()]);
   const [track, car] = [engine.makeTrack(TRACK), engine.makeCar()];
   const line = stad.middleLine(track);
   const WIDE = 20 / 3; // half the width of the road

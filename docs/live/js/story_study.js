@@ -10,7 +10,9 @@ stad.figure("study", async (part) => {
     const cleared = stad.clearCanvas(part("chart"));
     if (!cleared) return;
     const { context, width, height } = cleared;
-    const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(stad.color);
+    const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(
+      stad.color,
+    );
     const x = (points) => 8 + ((width - 16) * (points - LOW)) / (HIGH - LOW);
     context.fillStyle = faint;
     context.fillRect(x(-margin), 0, x(margin) - x(-margin), height - 22);
@@ -36,7 +38,8 @@ stad.figure("study", async (part) => {
     shown = true;
     draw();
     const text = rows.map(({ name, difference, interval }) => `${name}: ${difference.toFixed(1)} points (95% interval ${interval.map((end) => end.toFixed(1)).join(" to ")})`).join(". "); // prettier-ignore
-    part("answer").textContent = "No relevant gain was found. If the hand sees z alone, there is one: see below.";
+    part("answer").textContent =
+      "No relevant gain was found. If the hand sees z alone, there is one: see below.";
     stad.describe(part("chart"), text);
     stad.announce(text);
     part("after").hidden = false;

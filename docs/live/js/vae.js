@@ -1,72 +1,97 @@
 "use strict";
 // V, the variational autoencoder: a picture -> 32 numbers z -> a picture.
-// The same as stad_lab/models/vae.py, with its weights.
+// The same as stad_lab/models/vae.py, with its weights. The encoder runs in the compiled engine.
+// This script also runs in a worker, so it touches no document.
 globalThis.stad ??= {};
 
-stad.VAE = class {
-  /** @param tensors of `data/vae_VARIANT.js`, see stad.loadTensors */
-  constructor(tensors) {
-    const at = (name) => [tensors[`${name}.weight`], tensors[`${name}.bias`]];
-    this.down = [0, 2, 4, 6].map((layer) => stad.convolution(...at(`encoder.${layer}`)));
-    this.toMoments = stad.linear(channelsLast(tensors["encoder.9.weight"]), at("encoder.9")[1]);
-    // The first two layers of the decoder are linear, so the site's build has multiplied them.
-    this.fromLatent = stad.linear(...at("decoder.folded"));
-    this.up = [4, 6, 8].map((layer) => stad.transposedConvolution(...at(`decoder.${layer}`)));
-    this.latentSize = tensors["decoder.folded.weight"].shape[1];
-    this.seesDifference = tensors["encoder.0.weight"].shape[1] === 6;
-    this.reconstructsDifference = tensors["decoder.8.weight"].shape[1] === 6;
+stad.FRAME_SIZE ??= 64; // pixels, width and height of a frame
 
+stad.VAE = class {
+  /**
+   * @param {stad.Engine} engine
+   * @param tensors of `data/vae_VARIANT.js`, see stad.loadTensors
+   */
+  constructor(engine, tensors) {
+    const at = (name) => [tensors[`${name}.weight`], tensors[`${name}.bias`]];
+    const { memory } = engine;
+    [this.engine, this.memory] = [engine, memory];
+    this.channels = tensors["encoder.0.weight"].shape[1];
+    this.latentSize = tensors["decoder.folded.weight"].shape[1];
+    this.seesDifference = this.channels === 6;
+    this.reconstructsDifference = tensors["decoder.8.weight"].shape[1] === 6;
+    this.makeEncoder(at);
+    // The first two layers of the decoder are linear, so the site's build has multiplied them.
+    const [folded, offset] = at("decoder.folded");
+    const [outputs, latents] = folded.shape;
+    const weight = (i, o) => folded.data[o * latents + i];
+    this.fromLatent = stad.denseLayer(engine, [latents, outputs], weight, offset.data, 0);
+    this.up = [4, 6, 8].map((layer) => stad.transposedConvolution(...at(`decoder.${layer}`)));
+    const largest = Math.max(...this.down.map((one) => one.patches * one.outputs), outputs);
+    this.places = [memory.take(4 * largest), memory.take(4 * largest)];
+    this.pictures = memory.take(4 * stad.FRAME_SIZE ** 2 * this.channels);
+    this.frames = [0, 1].map(() => memory.take(3 * stad.FRAME_SIZE ** 2));
+  }
+
+  makeEncoder(at) {
+    let [size, channels] = [stad.FRAME_SIZE, this.channels]; // 64 -> 31 -> 14 -> 6 -> 2 pixels
+    this.down = [0, 2, 4, 6].map((part) => {
+      const layer = stad.convolution(this.engine, ...at(`encoder.${part}`), size, channels);
+      [size, channels] = [Math.sqrt(layer.patches), layer.outputs];
+      return layer;
+    });
     // PyTorch flattens channels first, our pictures have them last.
-    function channelsLast({ shape, data }) {
-      const pixels = 4;
-      const channels = shape[1] / pixels;
-      const ordered = new Float32Array(data.length);
-      for (let o = 0; o < shape[0]; o++)
-        for (let p = 0; p < pixels; p++)
-          for (let c = 0; c < channels; c++)
-            ordered[o * shape[1] + p * channels + c] = data[o * shape[1] + c * pixels + p];
-      return { shape, data: ordered };
-    }
+    const [{ shape, data }, bias] = at("encoder.9");
+    const [pixels, inputs] = [size * size, shape[1]];
+    const place = (i) => (i % channels) * pixels + Math.floor(i / channels);
+    const weight = (i, o) => (place(i) < inputs ? data[o * inputs + place(i)] : 0);
+    const sizes = [pixels * channels, shape[0]];
+    this.down.push(stad.denseLayer(this.engine, sizes, weight, bias.data));
   }
 
   /**
    * q(z | x) = N(mu, exp(logvar)).
-   * @param {Float32Array} frame 64 x 64 x 3 in [0, 1]
-   * @param {Float32Array} difference the same size in [-1, 1]; not read by variants without it
+   * @param {Uint8Array} frame 64 x 64 x 3
+   * @param {Uint8Array} earlier the frame from which the difference image is taken
    * @returns {{mu: Float32Array, logvar: Float32Array}}
    */
-  encode(frame, difference) {
-    let x = this.seesDifference ? sideBySide(frame, difference) : frame;
-    let size = stad.FRAME_SIZE; // 64 -> 31 -> 14 -> 6 -> 2 pixels
-    for (const layer of this.down) {
-      x = stad.relu(layer(x, size));
-      size = Math.floor((size - 4) / 2) + 1;
-    }
-    const moments = this.toMoments(x);
+  encode(frame, earlier) {
+    const moments = this.run(frame, earlier, 2 * this.latentSize);
     const logvar = moments.slice(this.latentSize).map((value) => stad.softBound(value, -10, 10));
     return { mu: moments.slice(0, this.latentSize), logvar };
+  }
 
-    function sideBySide(first, second) {
-      const both = new Float32Array(2 * first.length);
-      for (let p = 0, q = 0; p < first.length; p += 3, q += 6)
-        for (let c = 0; c < 3; c++) {
-          both[q + c] = first[p + c];
-          both[q + 3 + c] = second[p + c];
-        }
-      return both;
-    }
+  /** The mean of q(z | x) alone: what the agent sees. */
+  encodeMean(frame, earlier) {
+    return this.run(frame, earlier, this.latentSize);
+  }
+
+  run(frame, earlier, count) {
+    const { engine, memory } = this;
+    memory.write(this.frames[0], frame);
+    memory.write(this.frames[1], earlier);
+    engine.call("see", ...this.frames, this.pictures, BigInt(this.channels));
+    let [x, inputs] = [this.pictures, stad.FRAME_SIZE ** 2 * this.channels];
+    this.down.forEach((layer, i) => {
+      const y = this.places[i % 2];
+      layer.run(x, inputs, y);
+      [x, inputs] = [y, layer.patches * layer.outputs];
+    });
+    return memory.read(Float32Array, x, count).slice();
   }
 
   /**
-   * @param {Float32Array} z
+   * @param {ArrayLike<number>} z
    * @returns {{frame: Float32Array, difference: Float32Array | null}} in [0, 1] and [-1, 1]
    */
   decode(z) {
-    let x = stad.relu(this.fromLatent(z));
+    const [from, to] = this.places;
+    this.memory.read(Float32Array, from, z.length).set(z);
+    this.fromLatent.run(from, z.length, to);
+    let x = this.memory.read(Float32Array, to, this.fromLatent.outputs).slice();
     let size = 5; // 5 -> 13 -> 30 -> 64 pixels
     this.up.forEach((layer, number) => {
       x = layer(x, size);
-      if (number < 2) stad.relu(x);
+      if (number < 2) for (let i = 0; i < x.length; i++) if (x[i] < 0) x[i] = 0; // ReLU
       size = 2 * (size - 1) + (number ? 6 : 5);
     });
     const channels = this.reconstructsDifference ? 6 : 3;
@@ -82,10 +107,7 @@ stad.VAE = class {
 
   /** Load a shipped V: "frame", "input", "output" or "input_output". */
   static async load(variant) {
-    return new stad.VAE(await stad.loadTensors(`vae_${variant}`));
+    const parts = [stad.loadEngine(), stad.loadTensors(`vae_${variant}`)];
+    return new stad.VAE(...(await Promise.all(parts)));
   }
 };
-
-/** KL divergence of N(mu, exp(logvar)) from N(0, 1) in nats, for each latent by itself. */
-stad.klDivergence = ({ mu, logvar }) =>
-  mu.map((mean, i) => 0.5 * (mean ** 2 + Math.exp(logvar[i]) - 1 - logvar[i]));
