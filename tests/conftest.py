@@ -28,6 +28,7 @@ import numpy as np
 import pytest
 import torch
 from filelock import FileLock
+from firefox import Firefox
 from torch.optim.optimizer import register_optimizer_step_post_hook
 
 import stad_lab.envs
@@ -213,6 +214,17 @@ def browser():
         chromium = playwright.chromium.launch(executable_path=path, headless=True, args=flags)
         yield chromium
         chromium.close()
+
+
+@pytest.fixture
+def firefox(tmp_path):
+    """A headless Firefox."""
+    path = shutil.which("firefox") or shutil.which("firefox-esr")
+    if not path:
+        pytest.skip("no firefox on the PATH: install it (Debian: apt-get install firefox-esr)")
+    one = Firefox(path, tmp_path)
+    yield one
+    one.close()
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
 
-import json
-import re
 import secrets
 import shutil
 import subprocess
@@ -261,62 +259,6 @@ def test_sliders_the_map_and_another_v_change_the_picture_and_reset_brings_it_ba
     assert len(set(pictures)) == 6
     page.locator("#scrub").press("ArrowRight")
     page.wait_for_function("document.querySelector('#frame').ariaLabel === 'recorded frame 121'")
-
-
-class Firefox:
-    """The Firefox on the PATH, by WebDriver BiDi: Playwright drives only one of its own."""
-
-    def __init__(self, path, profile):
-        websocket = pytest.importorskip("websocket", reason="pip install -r environment.txt")
-        command = [path, "--headless", "--no-remote", "--profile", str(profile)]
-        self.process = subprocess.Popen(
-            [*command, "--remote-debugging-port=0"], stderr=subprocess.PIPE, text=True
-        )
-        told = (re.search(r"listening on (ws://\S+)", line) for line in self.process.stderr)
-        self.socket = websocket.create_connection(
-            next(filter(None, told))[1] + "/session", timeout=60, suppress_origin=True
-        )
-        self.number = 0
-        self.call("session.new", capabilities={})
-        self.tab = self.call("browsingContext.getTree")["contexts"][0]["context"]
-
-    def call(self, method, **parameters):
-        """One command; returns its result."""
-        self.number += 1
-        self.socket.send(json.dumps({"id": self.number, "method": method, "params": parameters}))
-        while (answer := json.loads(self.socket.recv())).get("id") != self.number:
-            pass
-        assert answer["type"] == "success", answer
-        return answer["result"]
-
-    def open(self, address):
-        """Open a page."""
-        self.call("browsingContext.navigate", context=self.tab, url=address, wait="complete")
-
-    def evaluate(self, function, argument=None):
-        """The value of a function, or of the promise that it returns, in the page."""
-        script = f"Promise.resolve(({function})({json.dumps(argument)})).then(JSON.stringify)"
-        target = {"context": self.tab}
-        found = self.call("script.evaluate", expression=script, target=target, awaitPromise=True)
-        assert found["type"] == "success", found
-        return json.loads(found["result"].get("value", "null"))
-
-    def close(self):
-        """End it."""
-        self.socket.close()
-        self.process.terminate()
-        self.process.wait(20)
-
-
-@pytest.fixture
-def firefox(tmp_path):
-    """A headless Firefox."""
-    path = shutil.which("firefox") or shutil.which("firefox-esr")
-    if not path:
-        pytest.skip("no firefox on the PATH: install it (Debian: apt-get install firefox-esr)")
-    one = Firefox(path, tmp_path)
-    yield one
-    one.close()
 
 
 READY = """async () => {

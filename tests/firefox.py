@@ -1,0 +1,52 @@
+"""A headless Firefox for tests of the live pages, driven over its own protocol."""
+
+import json
+import re
+import subprocess
+
+import pytest
+
+
+class Firefox:
+    """The Firefox on the PATH, by WebDriver BiDi: Playwright drives only one of its own."""
+
+    def __init__(self, path, profile):
+        websocket = pytest.importorskip("websocket", reason="pip install -r environment.txt")
+        command = [path, "--headless", "--no-remote", "--profile", str(profile)]
+        self.process = subprocess.Popen(
+            [*command, "--remote-debugging-port=0"], stderr=subprocess.PIPE, text=True
+        )
+        told = (re.search(r"listening on (ws://\S+)", line) for line in self.process.stderr)
+        self.socket = websocket.create_connection(
+            next(filter(None, told))[1] + "/session", timeout=60, suppress_origin=True
+        )
+        self.number = 0
+        self.call("session.new", capabilities={})
+        self.tab = self.call("browsingContext.getTree")["contexts"][0]["context"]
+
+    def call(self, method, **parameters):
+        """One command; returns its result."""
+        self.number += 1
+        self.socket.send(json.dumps({"id": self.number, "method": method, "params": parameters}))
+        while (answer := json.loads(self.socket.recv())).get("id") != self.number:
+            pass
+        assert answer["type"] == "success", answer
+        return answer["result"]
+
+    def open(self, address):
+        """Open a page."""
+        self.call("browsingContext.navigate", context=self.tab, url=address, wait="complete")
+
+    def evaluate(self, function, argument=None):
+        """The value of a function, or of the promise that it returns, in the page."""
+        script = f"Promise.resolve(({function})({json.dumps(argument)})).then(JSON.stringify)"
+        target = {"context": self.tab}
+        found = self.call("script.evaluate", expression=script, target=target, awaitPromise=True)
+        assert found["type"] == "success", found
+        return json.loads(found["result"].get("value", "null"))
+
+    def close(self):
+        """End it."""
+        self.socket.close()
+        self.process.terminate()
+        self.process.wait(20)
