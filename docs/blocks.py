@@ -33,6 +33,7 @@ from stad_lab.viz.replication import (
 
 PACKAGE = Path(config.__file__).parent
 AGENTS = (*config.VARIANTS, "cropped_input")
+TAB_SPEED = Path(__file__).parent / "live" / "engine" / "speed.json"
 
 
 def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
@@ -325,6 +326,13 @@ def speed_table(claims: dict, key: str, head: str) -> str:
     return table(heads, lines)
 
 
+def tab_table(claims: dict) -> str:
+    """The engine in a browser tab, from the record of docs/live/record_tab.py."""
+    record = json.loads(TAB_SPEED.read_text(encoding="utf-8"))
+    lines = [(driver, f"{speed:,.0f}") for driver, speed in record["median"].items()]
+    return table((f"in a tab ({record['browser'].split('.')[0]})", "frames a second"), lines)
+
+
 def costs_table(claims: dict) -> str:
     """The time of one frame with 16 cars, part by part."""
     costs = claims["speed"]["loop: microseconds of a frame, 16 cars in one process"]
@@ -437,6 +445,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "renderer": lambda claims: speed_table(
         claims, "renderer: frames a second on one core", "renderer"
     ),
+    "tab": tab_table,
     "loop": lambda claims: speed_table(claims, "loop: frames a second, a generation", "driver"),
     "costs": costs_table,
     "training": training_table,
