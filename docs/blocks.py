@@ -17,16 +17,16 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.evaluation.trajectories import MOTION
 from stad_lab.replication.claims import PAPER
 from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
-from stad_lab.replication.verdict import PAPER_GAIN, describe_verdict
+from stad_lab.replication.verdict import PAPER_GAIN, describe_meaning, describe_verdict
 from stad_lab.viz.replication import (
     DRIVERS,
     SEEN,
     SOURCES,
     TURNING,
     difference_of,
+    plot_drivers,
     plot_learning_curves,
     plot_primary,
-    plot_representation,
     plot_scores,
     plot_study,
 )
@@ -64,19 +64,9 @@ def paper_table(claims: dict) -> str:
 
 
 def finding(claims: dict) -> str:
-    """The finding of the replication in the overview: the verdict, and what z carries."""
-    yaw = {name: yaw_rates(claims, name) for name in config.VARIANTS}
-    others = max(value for name in config.VARIANTS[:3] for value in yaw[name])
-    told = " ".join(describe_verdict(claims["study1"])[:3])
-    return (
-        f"{told}\n\nUnder an agent the yaw rate is readable from z of `input_output` (R2 at least"
-        f" {min(yaw['input_output']):.2f}, others at most {others:.2f}), or any z with h."
-    )
-
-
-def yaw_rates(claims: dict, variant: str) -> list[float]:
-    """R2 of the yaw rate from z while the agent drives, of all V networks of study 3."""
-    return claims["study3"][f"agent: {variant}"]["z"]["yaw rate"]["values"]
+    """The finding of the replication in one sentence, for the overview."""
+    primary = {f: claims["study1"]["comparisons"][f"{f}: input_output"] for f in SEEN}
+    return describe_meaning(primary)
 
 
 def verdict(claims: dict) -> str:
@@ -210,8 +200,7 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
     "study1_scores": lambda claims: plot_scores(claims["study1"]["arms"]),
     "study1_curves": lambda claims: plot_learning_curves(claims["study1"]["curve_differences"]),
     "study1_primary": lambda claims: plot_primary(claims["study1"]["comparisons"], MARGIN),
-    "study3": lambda claims: plot_representation(claims["study3"]),
-    "study3_random": lambda claims: plot_representation(claims["study3"], "random_driver"),
+    "study3": lambda claims: plot_drivers(claims["study3"]),
 }
 
 
@@ -437,9 +426,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "turning": turning_table,
     "study3, agent": lambda claims: study3(claims, "agent"),
     "study3, random driver": lambda claims: study3(claims, "random_driver"),
-    "study3, figures": lambda claims: "\n\n".join(
-        image(name, claims) for name in ("study3", "study3_random")
-    ),
+    "study3, figure": lambda claims: image("study3", claims),
     "indicator bar": bar_table,
     "experiments": experiments_table,
     "renderer": lambda claims: speed_table(

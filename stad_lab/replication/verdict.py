@@ -44,8 +44,8 @@ def describe_meaning(primary: dict[str, dict]) -> str:
     """What the verdicts mean for a C that sees z and h, and for one that sees z alone."""
     both, alone = (describe_effect(primary[features]) for features in SEES)
     if both == alone:
-        return f"So {both}, whatever C sees."
-    return f"So if C sees z and h, as in the paper, {both}; if it sees z alone, {alone}."
+        return f"Whatever C sees, {both}."
+    return f"If C sees z and h, as in the paper, {both}; if it sees z alone, {alone}."
 
 
 def describe_effect(one: dict) -> str:

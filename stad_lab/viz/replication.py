@@ -125,10 +125,26 @@ def plot_representation(study3: dict, driver: str = "agent") -> Figure:
         study3: "DRIVER: VARIANT" -> features -> quantity -> "mean", "interval" and "values".
         driver: "agent" or "random_driver".
     """
-    start = f"{driver}: "
-    rows = {name.removeprefix(start): one for name, one in study3.items() if name.startswith(start)}
-    parts = "mean", "interval", "values"
+    panels = representation(study3, driver)
+    title = f"Study 3: what {study3['networks']} V networks and untrained ones carry, a line each"
+    return plot_probe(panels, f"{title} ({DRIVERS[driver]} drives)")
+
+
+def plot_drivers(study3: dict) -> Figure:
+    """What a single frame does not show, with both drivers: `plot_representation` side by side."""
     panels = {
+        f"{quantity}, {name} drives": representation(study3, driver)[quantity]
+        for driver, name in DRIVERS.items()
+        for quantity in TURNING
+    }
+    return plot_probe(panels, f"Study 3: the motion that {study3['networks']} V networks carry")
+
+
+def representation(study3: dict, driver: str) -> dict[str, dict]:
+    """Quantity -> row -> "from z" or "from z and h" -> mean, interval and value of each network."""
+    start, parts = f"{driver}: ", ("mean", "interval", "values")
+    rows = {name.removeprefix(start): one for name, one in study3.items() if name.startswith(start)}
+    return {
         quantity: {
             row: {
                 f"from {SOURCES[f]}": tuple(by[quantity][part] for part in parts)
@@ -138,13 +154,16 @@ def plot_representation(study3: dict, driver: str = "agent") -> Figure:
         }
         for quantity in next(iter(rows.values()))["z"]
     }
-    title = f"Study 3: what {study3['networks']} V networks and untrained ones carry, a line each"
-    title += f" ({DRIVERS[driver]} drives)"
+
+
+def plot_probe(panels: dict[str, dict], title: str) -> Figure:
+    """Panels of R2, whose alternative text has the means from z of what a frame does not show."""
     figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
     told = [
-        f"{quantity} of {row} {round(panels[quantity][row]['from z'][0], 2) + 0.0:.2f}"
-        for quantity in TURNING
-        for row in rows
+        f"{panel} of {row} {round(one['from z'][0], 2) + 0.0:.2f}"
+        for panel, rows in panels.items()
+        if panel.startswith(TURNING)
+        for row, one in rows.items()
     ]
     return describe(figure, title, "Mean R2 from z: ", told)
 
