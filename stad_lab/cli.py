@@ -490,31 +490,26 @@ def ship(run: str, name: str) -> None:
     print(f"shipped to {ship(run, name)}")
 
 
-def film(
-    agent: str, out: str, viewer: bool = False, track: int = 5, first: int = 60, frames: int = 240
-) -> None:
+def film(agent: str, out: str, track: int = 5, first: int = 60, frames: int = 240) -> None:
     """Make a film of an agent driving: observation, difference image, reconstruction and dream.
 
     Args:
         agent: A shipped agent, or the folder of a run.
-        out: The .gif to write; with --viewer it may be a .webp.
-        viewer: Show latents, prediction, action and return, too.
+        out: The .gif to write.
         track: Seed of the track.
         first: First frame shown; 60 is after the opening zoom.
         frames: Frames covered; every third is shown.
     """
     file = output(out)
-    kind = file.suffix.lstrip(".").lower()
-    if kind not in ("gif", "webp") or (kind == "webp" and not viewer):
-        raise ValueError(f"--out {file}: expected a .gif (or, with --viewer, a .webp)")
+    if file.suffix.lower() != ".gif":
+        raise ValueError(f"--out {file}: expected a .gif")
     from stad_lab.agent import load_agent
     from stad_lab.io.files import check_writable, write_bytes
-    from stad_lab.viz.video import film_agent, film_viewer
+    from stad_lab.viz.video import film_agent
 
     loaded = load_agent(agent)
     check_writable(file)
-    shown = (loaded, track, first, frames)
-    write_bytes(file, film_viewer(*shown, kind=kind) if viewer else film_agent(*shown))
+    write_bytes(file, film_agent(loaded, track, first, frames))
     print(f"filmed to {file}")
 
 

@@ -1,26 +1,21 @@
-"""Animations: pictures or figures that move, and an agent at the wheel beside its dreams."""
+"""Animations: pictures that move, and an agent at the wheel beside its dreams."""
 
 import io
-from collections.abc import Iterable
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
-from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent
 from stad_lab.dreaming import dream_on
 from stad_lab.envs.frames import earlier_frames, to_pictures
 from stad_lab.evaluation.trajectories import (
     FRAMES_A_SECOND,
-    Inspection,
     Trajectory,
-    inspect_trajectory,
     record_trajectory,
 )
 from stad_lab.models.vae import to_tensor, to_uint8
-from stad_lab.viz.plots import difference_colors, plot_moment, to_png
+from stad_lab.viz.plots import difference_colors
 
 EVERY = 3  # one of so many frames is shown, at the real speed
 DREAM = 100  # frames of an open-loop dream: two seconds
@@ -52,21 +47,8 @@ def animate_pictures(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
     return save_pages(pages, fps, "gif")
 
 
-def animate_figures(figures: Iterable[Figure], fps: float, kind: str = "gif") -> bytes:
-    """Figures of one size as an animation: "gif", or "webp", which is sharper and smaller.
-
-    Raises ValueError for another kind, or no figures.
-    """
-    if kind not in ("gif", "webp"):
-        raise ValueError(f"kind={kind!r}: expected 'gif' or 'webp', by the file's name too")
-    pages = [Image.open(io.BytesIO(to_png(figure))).convert("RGB") for figure in figures]
-    if not pages:
-        raise ValueError("no figures: expected at least one")
-    return save_pages(pages, fps, kind)
-
-
 def save_pages(pages: list[Image.Image], fps: float, kind: str) -> bytes:
-    """Pages as an endless animation."""
+    """Pages as an endless animation, "gif" or "webp"."""
     buffer, pause = io.BytesIO(), round(1000 / fps)  # milliseconds
     pages[0].save(buffer, kind, save_all=True, append_images=pages[1:], duration=pause, loop=0)
     return buffer.getvalue()
@@ -113,22 +95,6 @@ def repeated_dreams(
             frames = min(length, len(trajectory) - moment)
             dreams.append(dream_on(agent, frames, seed=len(dreams))[0])
     return np.concatenate(dreams)
-
-
-def film_viewer(agent: Agent, track: int, first: int, frames: int, kind: str = "gif") -> bytes:
-    """The trajectory viewer of an agent's episode as an animation: arguments as `film_agent`."""
-    trajectory = record_longer(agent, track, first, frames)
-    inspection = inspect_trajectory(agent.world_model, trajectory)
-    return film_trajectory(trajectory, inspection, first, kind)
-
-
-def film_trajectory(
-    trajectory: Trajectory, inspection: Inspection, first: int = 0, kind: str = "gif"
-) -> bytes:
-    """The trajectory viewer as an animation, one moment in EVERY, at the real speed."""
-    moments = tqdm(range(first, len(trajectory), EVERY), "film", unit="picture")
-    figures = (plot_moment(trajectory, inspection, moment) for moment in moments)
-    return animate_figures(figures, FRAMES_A_SECOND / EVERY, kind)
 
 
 def record_longer(agent: Agent, track: int, first: int, frames: int) -> Trajectory:

@@ -2,7 +2,6 @@
 
 import base64
 import contextlib
-import functools
 import html
 import inspect
 import io
@@ -19,10 +18,9 @@ from pygments import highlight
 from pygments.formatters import HtmlFormatter
 from pygments.lexers import PythonLexer
 
-from stad_lab.evaluation.trajectories import Inspection, Trajectory
 from stad_lab.models.vae import VAE, to_array, to_uint8
 from stad_lab.training.evolution import Watch
-from stad_lab.viz.plots import BLUE, difference_colors, plot_moment, to_png
+from stad_lab.viz.plots import BLUE, difference_colors, to_png
 from stad_lab.viz.video import enlarged
 
 
@@ -123,12 +121,6 @@ def slider(low: float, high: float, value: float, label: str) -> ipywidgets.Widg
     style = {"description_width": "initial"}
     range_of = {"min": low, "max": high, "step": step, "continuous_update": False}
     return kind(value, description=label, style=style, **range_of)
-
-
-def view_trajectory(trajectory: Trajectory, inspection: Inspection) -> ipywidgets.VBox:
-    """One moment of an episode (`plot_moment`), on a time slider."""
-    draw = functools.partial(plot_moment, trajectory, inspection)
-    return explore(draw, moment=slider(0, len(trajectory) - 1, 0, "frame"))
 
 
 def explore_latents(vae: VAE, z: np.ndarray) -> ipywidgets.VBox:

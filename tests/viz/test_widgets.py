@@ -13,14 +13,13 @@ from PIL import Image
 
 from stad_lab.evaluation.trajectories import inspect_trajectory, record_trajectory
 from stad_lab.viz.plots import plot_moment
-from stad_lab.viz.video import animate_figures, animate_pictures, film_agent, film_viewer
+from stad_lab.viz.video import animate_pictures, film_agent
 from stad_lab.viz.widgets import (
     explore,
     explore_latents,
     show,
     show_animation,
     slider,
-    view_trajectory,
     watch_training,
 )
 
@@ -60,21 +59,9 @@ def test_the_latent_explorer_begins_at_its_z_even_far_out(agent):
     ] == pytest.approx(z.tolist(), abs=0.006)
 
 
-def test_the_viewer_shows_another_picture_for_another_moment(inspected):
-    viewer = view_trajectory(*inspected)
-    control, picture = viewer.children
-    before = picture.value
-    control.value = 8
-    assert picture.value != before and "Frame 8 of 9" in picture.value
-
-
 def test_what_cannot_be_shown_is_refused(inspected):
     with pytest.raises(ValueError, match="moment=9: expected 0 to 8"):
         plot_moment(*inspected, 9)
-    with pytest.raises(ValueError, match="kind='mp4': expected 'gif' or 'webp'"):
-        animate_figures([], 10, "mp4")
-    with pytest.raises(ValueError, match="no figures"):
-        animate_figures([], 10)
     with pytest.raises(ValueError, match="expected one length"):
         animate_pictures({"a": np.zeros((2, 8, 8, 3), np.uint8), "b": np.zeros((1, 8, 8, 3))})
 
@@ -110,7 +97,6 @@ def pages(content):
 def test_a_film_shows_one_frame_of_three(agent):
     count, (width, height) = pages(film_agent(agent, track=4, first=5, frames=10))
     assert count == 4 and width == 4 * 192 + 3 * 6 and height == 192 + 20
-    assert pages(film_viewer(agent, track=4, first=2, frames=5, kind="webp"))[0] == 2
     with pytest.raises(ValueError, match="frames=0: expected at least 1"):
         film_agent(agent, 4, 0, 0)
 
