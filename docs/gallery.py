@@ -14,12 +14,12 @@ from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 PICTURES = NOTEBOOKS / "pictures"
-CELLS = ("00-11", "01-16", "02-17", "03-31", "04-19", "06-15")
+CELLS = ("00-11", "01-16", "02-33", "02b-22", "03-31", "04-19", "06-15")
 
 
 def figure_of(cell: str) -> bytes:
     """The PNG that a cell of a notebook shows, after the notebook has run up to this cell."""
-    (notebook,) = NOTEBOOKS.glob(f"{cell[:2]}_*.ipynb")
+    (notebook,) = NOTEBOOKS.glob(f"{cell.partition('-')[0]}_*.ipynb")
     ran = nbformat.read(notebook, as_version=4)
     last = [one["id"] for one in ran.cells].index(cell)
     ran.cells = ran.cells[: last + 1]

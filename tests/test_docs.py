@@ -189,7 +189,7 @@ def test_every_notebook_and_module_has_its_page_and_the_index_of_words_is_there(
     assert set(blocks.modules()) == set(pages)
     assert "load_agent" in pages["stad_lab.agent"].read_text(encoding="utf-8")
     index = (folder / "searchindex.js").read_text(encoding="utf-8")
-    assert "notebooks/02_difference_autoencoders" in index
+    assert "notebooks/02b_what_latents_carry" in index
 
 
 def test_a_notebook_that_runs_shows_its_figure_and_a_live_page_instead_of_its_widget(site):

@@ -286,8 +286,7 @@ def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     assert all(re.fullmatch(file.stem.partition("_")[0] + r"-\d\d", name) for name in ids)
     assert len(set(ids)) == len(ids)
     assert 15 <= len(ids) <= 55
-    # 02 is still to be split in two: it keeps the limits of before.
-    tall, wide, most = (15, 100, 4000) if file.stem.startswith("02") else (12, 88, 2500)
+    tall, wide, most = 12, 88, 2500
     lines = {name: source.splitlines() for name, source in code.items()}
     long = {name for name, own in lines.items() if len(own) > tall or max(map(len, own)) > wide}
     assert long <= folded
