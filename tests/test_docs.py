@@ -140,14 +140,14 @@ def test_every_command_on_a_page_is_one_that_the_command_line_takes(name):
 def test_every_step_and_figure_that_a_page_names_exists(name):
     page = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
     notebooks = {
-        file.name[:2]: file.read_text(encoding="utf-8")
+        file.name.partition("_")[0]: file.read_text(encoding="utf-8")
         for file in (ROOT / "notebooks").glob("0*.ipynb")
     }
-    named = r"\b(0[0-6]), (?:from )?steps? (\d+)(?:(?:, \d+)*(?:,| and| to) (\d+))?"
+    named = r"\b(0[0-6]b?), (?:from )?steps? (\d+)(?:(?:, \d+)*(?:,| and| to) (\d+))?"
     for notebook, *numbers in re.findall(named, page):
         for number in filter(None, numbers):
             assert f"## Step {number}. " in notebooks[notebook], f"{notebook}, step {number}"
-    for notebook, title in re.findall(r"\b(0[0-6]), step \d+, \*([^*]+)\*", page):
+    for notebook, title in re.findall(r"\b(0[0-6]b?), step \d+, \*([^*]+)\*", page):
         assert title in notebooks[notebook], f"{notebook}: {title}"
 
 
@@ -170,7 +170,7 @@ def test_the_figure_of_a_cell_is_the_one_that_a_reader_sees(tmp_path, monkeypatc
     notebook = json.loads(small_notebook(cell)) | {"nbformat_minor": 5}
     for number, one in enumerate(notebook["cells"]):
         one["id"] = f"7-{number}"
-    (tmp_path / "7-_small.ipynb").write_text(json.dumps(notebook))
+    (tmp_path / "7_small.ipynb").write_text(json.dumps(notebook))
     monkeypatch.setattr(gallery, "NOTEBOOKS", tmp_path)
     picture = Image.open(io.BytesIO(gallery.figure_of("7-1")))
     assert picture.size == (100, 100) and picture.text["Description"] == "an empty square"
