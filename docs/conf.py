@@ -23,6 +23,7 @@ gc.set_threshold(100_000)  # Sphinx keeps what it makes: it looks for garbage a 
 HERE = Path(__file__).parent
 PACKAGE = HERE.parent / "stad_lab"
 sys.path[:0] = [str(HERE), str(HERE / "live")]
+from colab import address  # noqa: E402
 from live_build import write_scripts  # noqa: E402
 from site_check import faults  # noqa: E402
 
@@ -131,6 +132,16 @@ def explain_widgets(app, doctree) -> None:
             bundle.replace_self(nodes.container("", note, classes=["without-kernel"]))
 
 
+def offer_colab(app, doctree) -> None:
+    """Put a link to Colab below the title of a notebook, if GitHub builds the site."""
+    repository, page = os.environ.get("GITHUB_REPOSITORY"), Path(app.env.docname)
+    if not repository or page.parent.as_posix() != "notebooks":
+        return
+    where = address(repository, f"{page.name}.ipynb")
+    link = nodes.reference("", "Open in Google Colab", refuri=where)
+    doctree.next_node(nodes.title).parent.insert(1, nodes.paragraph("", "", link))
+
+
 def help_screen_readers(app, page, template, context, doctree) -> None:
     """Give the sidebar's headings their level, and make an empty header cell an ordinary one."""
     for part in {"body", "furo_navigation_tree"} & context.keys():
@@ -160,6 +171,7 @@ def check_site(app, error) -> None:
 def setup(app) -> None:
     """Connect them; the check runs last, after MathJax has been copied."""
     app.connect("doctree-read", explain_widgets)
+    app.connect("doctree-read", offer_colab)
     app.connect("html-page-context", style_live_page)
     app.connect("build-finished", write_live_scripts)
     app.connect("html-page-context", help_screen_readers, priority=900)  # the theme's come first

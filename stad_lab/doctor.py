@@ -23,7 +23,7 @@ LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = ("numpy", "scipy", "pandas", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma")
 MODULES += ("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl")
 NEEDED = ("", "train")  # extras without which the notebooks do not run
-OPTIONAL_MODULES = ("matplotlib", "PIL", "sklearn", "ipywidgets", "distributed")  # of the extras
+OPTIONAL_MODULES = ("matplotlib", "PIL", "ipywidgets", "distributed")  # of the extras
 
 
 @dataclass(frozen=True)

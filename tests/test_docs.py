@@ -6,6 +6,7 @@ runs one small notebook in their place.
 
 import io
 import json
+import os
 import re
 import shlex
 import shutil
@@ -23,6 +24,7 @@ from stad_lab.replication.claims import read_claims
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
 import blocks  # noqa: E402
+import colab  # noqa: E402
 import gallery  # noqa: E402
 import renew  # noqa: E402
 from site_check import faults  # noqa: E402
@@ -46,6 +48,7 @@ CELLS = (
     "show_animation(film, 'a black film')",
     "import pandas\npandas.DataFrame({f'a long name {n}': [n] for n in range(20)})",
 )
+LAB = "someone/their_lab"  # a repository on GitHub
 SERIOUS = {"serious", "critical"}  # impacts of axe
 # axe's rule on contrast is slow. Ink and paper follow from tags, classes and styles, so of all
 # texts that have these alike, up to the root, one stays.
@@ -90,7 +93,8 @@ def site(tmp_path_factory):
         f"nb_execution_cache_path = {str(source / 'cache')!r}\n"
     )
     command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", source, out]
-    return out, subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    run = {"capture_output": True, "text": True, "timeout": 600, "check": False}
+    return out, subprocess.run(command, env=os.environ | {"GITHUB_REPOSITORY": LAB}, **run)
 
 
 def test_no_page_is_stale():
@@ -176,6 +180,19 @@ def test_the_figure_of_a_cell_is_the_one_that_a_reader_sees(tmp_path, monkeypatc
     assert picture.size == (100, 100) and picture.text["Description"] == "an empty square"
 
 
+def test_a_notebook_for_colab_installs_first_and_has_no_relative_link(tmp_path):
+    colab.main(LAB, str(tmp_path))
+    for file in (ROOT / "notebooks").glob("*.ipynb"):
+        cells = json.loads((tmp_path / file.name).read_text(encoding="utf-8"))["cells"]
+        first = next(cell for cell in cells if cell["cell_type"] == "code")
+        assert f"github.com/{LAB} stad_lab" in "".join(first["source"])
+        texts = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "markdown"]
+        for link in re.findall(r"\]\(([^)]+)\)", "".join(texts)):
+            assert link.startswith("https://"), link
+    with pytest.raises(SystemExit, match="expected OWNER/NAME"):
+        colab.main(f"https://github.com/{LAB}", str(tmp_path))
+
+
 def test_the_site_builds_without_a_warning(site):
     _, process = site
     assert process.returncode == 0, process.stdout + process.stderr
@@ -197,6 +214,7 @@ def test_a_notebook_that_runs_shows_its_figure_and_a_live_page_instead_of_its_wi
     assert 'alt="an empty square"' in page and "data:image/png;base64," in page
     assert page.count('class="without-kernel') == 1 and "VBox(" not in page and "%|" not in page
     assert 'href="../docs/live/dream.html"' in page
+    assert f"colab.research.google.com/github/{LAB}/blob/colab/00_small.ipynb" in page
 
 
 def test_formulas_come_from_the_site_itself(site):

@@ -235,7 +235,7 @@ def test_in_new_environments_the_engine_drives_and_with_train_an_agent_does(tmp_
 import importlib.util
 from stad_lab import load_agent
 from stad_lab.agent import drive
-for name in ("matplotlib", "IPython", "jupyterlab", "pytest", "sphinx", "distributed", "sklearn"):
+for name in ("matplotlib", "IPython", "jupyterlab", "pytest", "sphinx", "distributed"):
     assert importlib.util.find_spec(name) is None, name
 episodes = drive(load_agent("frame"), [0])
 print(episodes.returns[0], episodes.lengths[0])
