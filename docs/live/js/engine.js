@@ -523,6 +523,14 @@ stad.LONGEST = 1000; // frames of an episode
       this.reset();
     }
 
+    /** Another driver with the same V and M: it has its own C, and its own past. */
+    share(parameters) {
+      const other = Object.create(this);
+      other.parameters = parameters;
+      other.reset();
+      return other;
+    }
+
     /** Copy a layer into the module's memory. */
     keep(starts, [rows, row, run], { weights, bias }, floor) {
       const { memory } = this;
