@@ -6,7 +6,7 @@ stad.start(async () => {
   const AGENTS = ["frame", "input", "output", "input_output", "cropped_input"];
   const [ORANGE, BLUE, PURPLE] = ["#E69F00", "#0072B2", "#CC79A7"];
   const [FIELD, VIEW] = [333, 62]; // world units: half the field, and the height of the picture
-  const lacking = whatIsMissing();
+  const lacking = stad.whatIsMissing();
   if (lacking) throw new Error(lacking);
 
   let [track, state, before, arrived] = [null, null, null, 0];
@@ -20,14 +20,10 @@ stad.start(async () => {
   // --- The worker ---------------------------------------------------------------------------------
 
   async function startWorker() {
-    const { code, tables, facts, source } = await stad.load("engine");
-    const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
-    const found = new Worker(url);
-    found.addEventListener("message", ({ data }) => receive(data));
-    found.addEventListener("error", (event) => stad.fail(new Error(event.message)));
-    const bytes = await Promise.all([code, tables].map(stad.unpack));
-    found.postMessage({ type: "load", code: bytes[0], facts, tables: bytes[1] });
-    return found;
+    const { workers, engine } = await stad.startWorkers("race", 1);
+    workers[0].addEventListener("message", ({ data }) => receive(data));
+    workers[0].postMessage({ type: "load", ...engine });
+    return workers[0];
   }
 
   /** Give the worker the networks of an agent. */
@@ -513,21 +509,6 @@ stad.start(async () => {
     }
     if (asked.seed !== seed) drive(asked.seed);
   });
-
-  function whatIsMissing() {
-    if (typeof WebAssembly !== "object") return "It needs WebAssembly, which this browser lacks.";
-    if (typeof Worker === "undefined") return "It needs workers, which this browser lacks.";
-    if (typeof DecompressionStream === "undefined")
-      return "It needs a newer browser, with DecompressionStream.";
-    // A module with one SIMD instruction.
-    const simd = [
-      0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253,
-      15, 253, 98, 11,
-    ];
-    if (!WebAssembly.validate(Uint8Array.from(simd)))
-      return "It needs WebAssembly SIMD, which this browser lacks.";
-    return null;
-  }
 
   await choose(agent);
   drive(seed);
