@@ -185,6 +185,11 @@ stad.start(async () => {
   const kept = stad.evolveSettings.kept();
   if (kept) bet = kept.bet;
   await restart(kept?.settings ?? stad.evolveSettings.fromAddress(), kept?.log);
-  stad.page = { crew, view, get log() { return log; }, get states() { return states; } }; // prettier-ignore
+  stad.page = {
+    view,
+    get log() { return log; },
+    get states() { return states; },
+    get busy() { return driving !== null; },
+  }; // prettier-ignore
   requestAnimationFrame(draw);
 });
