@@ -39,7 +39,8 @@ stad.start(async () => {
     for (const [number, seed] of tracks.entries()) {
       const track = await crew.lead("track", { seed });
       if (own !== run) return;
-      view.begin(track, drivers.length, tracks.length > 1 ? number + 1 : 0);
+      const name = tracks.length > 1 ? `, track ${number + 1}` : "";
+      view.begin(track, drivers.length, `Generation ${log.length + 1}${name}.`);
       const found = await crew.drive(drivers, seed, LIMITS, (car, at) => view.map.move(car, at));
       if (!found || own !== run) return; // a fresh start meanwhile
       found.forEach((one, i) => driven[i].push(one));
@@ -79,7 +80,7 @@ stad.start(async () => {
     const track = await crew.lead("track", { seed: next.tracks[0] });
     if (own !== run) return;
     [log, states, upcoming, finished] = [kept, found, next, null];
-    view.begin(track, settings.population + 1, 0);
+    view.begin(track, settings.population + 1, "");
     stad.evolveSettings.show(settings);
     show();
   }

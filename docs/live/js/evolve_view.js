@@ -1,110 +1,12 @@
 "use strict";
-// The pictures of the page "Evolve a driver": the map with all cars, and the plane of two weights.
+// What the page "Evolve a driver" shows after a generation: curves, the plane of two weights, words.
 globalThis.stad ??= {};
 
 {
   const get = stad.get;
-  const HALF_WIDTH = 20 / 3; // of the road, world units
   const LATENTS = 32; // numbers of z
   const { orange, green, blue, red } = stad.COLORS;
-  const [CAR, BEST] = [6, 10]; // pixels, lengths of cars
-
-  stad.EvolveMap = class {
-    /** @param {HTMLCanvasElement} canvas a square */
-    constructor(canvas) {
-      [this.canvas, this.cars, this.track, this.layer] = [canvas, [], null, null];
-      new ResizeObserver(() => this.draw()).observe(canvas);
-      stad.onTheme(() => this.draw());
-    }
-
-    /** A track from the engine, and so many cars at its start; the last one is the mean's. */
-    begin(track, count) {
-      this.track = { ...track, line: stad.middleLine(track) };
-      this.cars = Array.from({ length: count }, () => ({ path: [], score: 0, going: true }));
-      this.layer = null;
-      this.draw();
-    }
-
-    /** Where a car is now. */
-    move(number, { x, y, angle, score, going }) {
-      const car = this.cars[number];
-      if (!car) return;
-      const last = car.path.at(-1);
-      if (!last || Math.hypot(x - last[0], y - last[1]) > 1) {
-        car.path.push([x, y]);
-        if (this.layer) this.extend(car);
-      }
-      Object.assign(car, { at: [x, y], angle, score, going });
-    }
-
-    /** The candidate with the highest score so far; the mean is none. */
-    get best() {
-      const candidates = this.cars.slice(0, -1);
-      return candidates.reduce((best, car) => (car.score > best.score ? car : best), candidates[0]);
-    }
-
-    draw() {
-      const cleared = stad.clearCanvas(this.canvas);
-      if (!cleared || !this.track) return;
-      const { context, width } = cleared;
-      const key = [this.canvas.width, stad.color("--color-background-primary")].join();
-      if (this.layer?.key !== key) this.paint(key, width);
-      context.drawImage(this.layer.picture, 0, 0, width, width);
-      const [mean, best] = [this.cars.at(-1), this.best];
-      for (const car of this.cars)
-        if (car.at && car !== mean && car !== best)
-          this.drawCar(context, car, CAR, car.going ? blue : "#8c8c8c");
-      for (const [car, color] of [
-        [mean, green],
-        [best, orange],
-      ]) {
-        stad.strokeLine(context, car.path.map(this.layer.place), color, 2);
-        if (car.at) this.drawCar(context, car, BEST, color, "white");
-      }
-    }
-
-    /** The road and the paths so far, on a canvas of their own: only new pieces are added to it. */
-    paint(key, width) {
-      const picture = document.createElement("canvas");
-      [picture.width, picture.height] = [this.canvas.width, this.canvas.width];
-      const context = picture.getContext("2d");
-      context.scale(picture.width / width, picture.width / width);
-      const { line } = this.track;
-      const { place, scale } = stad.projectMap(line, width, 0.06 * width);
-      context.lineJoin = "round";
-      const road = [...line, line[0]].map(place);
-      stad.strokeLine(context, road, "#8a8a8a", 2 * HALF_WIDTH * scale);
-      stad.fillDot(context, road[0], 4, "white");
-      this.layer = { key, picture, context, place };
-      for (const car of this.cars) this.extend(car, car.path.length);
-    }
-
-    /** Add the last piece of a car's path, or all of it. */
-    extend(car, count = 2) {
-      const { context, place } = this.layer;
-      stad.strokeLine(context, car.path.slice(-count).map(place), "rgba(0, 60, 110, 0.3)", 1);
-    }
-
-    drawCar(context, { at, angle }, length, color, edge) {
-      const [x, y] = this.layer.place(at);
-      context.save();
-      context.translate(x, y);
-      context.rotate(-angle);
-      context.beginPath();
-      context.moveTo(0, -length);
-      context.lineTo(0.6 * length, 0.8 * length);
-      context.lineTo(-0.6 * length, 0.8 * length);
-      context.closePath();
-      context.fillStyle = color;
-      context.fill();
-      if (edge) {
-        context.strokeStyle = edge;
-        context.lineWidth = 1.5;
-        context.stroke();
-      }
-      context.restore();
-    }
-  };
+  const OTHERS = "#8c8c8c";
 
   /** The candidates in the plane of the two weights that the mean had moved most before. */
   function drawPlane(canvas, { states, finished, scores }) {
@@ -138,7 +40,7 @@ globalThis.stad ??= {};
     stad.strokeLine(context, path.map(place), green, 2);
     const order = scores.map((_, i) => i).sort((a, b) => scores[b] - scores[a]);
     order.forEach((i, rank) => {
-      const color = rank === 0 ? orange : rank < order.length / 2 ? blue : "#8c8c8c";
+      const color = rank === 0 ? orange : rank < order.length / 2 ? blue : OTHERS;
       if (points[i]) stad.fillDot(context, place(points[i]), 4, color);
     });
     context.strokeStyle = red;
@@ -162,6 +64,8 @@ globalThis.stad ??= {};
   }
 
   const average = (values) => values.reduce((total, one) => total + one, 0) / values.length;
+  const best = (values) => Math.max(...values);
+  const worst = (values) => Math.max(0, Math.min(...values)); // the chart begins at 0
 
   stad.EvolveView = class {
     constructor() {
@@ -173,10 +77,10 @@ globalThis.stad ??= {};
       stad.onTheme(() => this.drawPlane());
     }
 
-    /** A track is driven next by so many; `number` says which of several tracks it is, or 0. */
-    begin(track, count, number) {
+    /** So many cars drive on a track next. */
+    begin(track, count, name) {
       this.map.begin(track, count);
-      get("which").textContent = number ? ` Track ${number}.` : "";
+      get("which").textContent = name;
     }
 
     /** Show the evolution after a generation: the curves, the plane and the words. */
@@ -195,49 +99,43 @@ globalThis.stad ??= {};
 
     showCurves(rows) {
       const { log, states, lap } = this.shown;
-      const line = (values, color) => ({ points: values.map((value, i) => [i + 1, value]), color });
-      this.curve.axes.xMax = this.steps.axes.xMax = Math.max(20, log.length);
-      this.curve.show({
-        lines: [
-          line(
-            rows.map((row) => Math.max(0, Math.min(...row))),
-            "#999999",
-          ),
-          line(
-            rows.map((row) => Math.max(...row)),
-            orange,
-          ),
-          line(rows.map(average), blue),
-          line(
-            log.map(({ mean }) => average(mean)),
-            green,
-          ),
-        ],
-        marks: lap ? [{ x: lap, text: "first lap" }] : [],
+      const line = (values, color, first = 1) => ({
+        points: values.map((value, i) => [i + first, value]),
+        color,
       });
       const sigmas = states.map(({ sigma }) => sigma);
+      this.curve.axes.xMax = this.steps.axes.xMax = Math.max(20, log.length);
       this.steps.axes.yMax = 1.3 * Math.max(...sigmas);
-      this.steps.show({ lines: [{ points: sigmas.map((sigma, i) => [i, sigma]), color: red }] });
+      this.steps.show({ lines: [line(sigmas, red, 0)] });
+      const lines = [
+        line(rows.map(worst), "#999999"),
+        line(rows.map(best), orange),
+        line(rows.map(average), blue),
+        line(log.map((entry) => average(entry.mean)), green),
+      ]; // prettier-ignore
+      this.curve.show({ lines, marks: lap ? [{ x: lap, text: "first lap" }] : [] });
     }
 
     showWords(rows) {
       const { log, states, lap, bet, settings, workers } = this.shown;
       const [number, last, sigma] = [log.length, log.at(-1), states.at(-1).sigma.toFixed(3)];
       const total = (name, count) => log.slice(0, count).reduce((sum, one) => sum + one[name], 0);
-      const [best, middle] = [Math.max, (...row) => average(row)].map((f) => number && f(...rows.at(-1)).toFixed(0)); // prettier-ignore
+      const points = (f) => f(rows.at(-1)).toFixed(0);
       const text = number
-        ? `Generation ${number}: best ${best} points, average ${middle}, mean driver ` +
-          `${average(last.mean).toFixed(0)}. Whole laps: ${last.laps} of ${settings.population}. σ ${sigma}.`
+        ? `Generation ${number}: best ${points(best)} points, average ${points(average)}, ` +
+          `mean driver ${average(last.mean).toFixed(0)}. ` +
+          `Whole laps: ${last.laps} of ${settings.population}. σ ${sigma}.`
         : "Nobody has driven yet.";
       get("summary").textContent = text;
-      get("driven").textContent = `${total("frames").toLocaleString("en")} frames in ${total("seconds").toFixed(0)} seconds, on ${workers} workers.`; // prettier-ignore
+      const time = (count) => `${total("seconds", count).toFixed(0)} seconds`;
+      get("driven").textContent =
+        `${total("frames").toLocaleString("en")} frames in ${time()}, on ${workers} workers.`;
       get("answer").textContent = lap
-        ? `You said ${bet}: the first whole lap came in generation ${lap}, after ${total("seconds", lap).toFixed(0)} seconds.`
+        ? `You said ${bet}: the first whole lap came in generation ${lap}, after ${time(lap)}.`
         : "";
       stad.describe(get("map"), `A track from above, with all candidates. ${text}`);
       stad.describe(get("learning"), `Points of ${number} generations. ${text}`);
       stad.describe(get("steps"), `The step size of each generation, now ${sigma}.`);
-      for (const one of document.querySelectorAll("[data-agent]")) one.textContent = settings.agent;
     }
 
     drawPlane() {

@@ -264,8 +264,9 @@ stad.start(async () => {
     const time = phase === "attract" ? rival.frames : you.frames;
     set("time", `${seconds(time)} s`);
     const driven = Math.round(100 * you.tiles);
+    const name = driver ? "evolved driver" : `agent ${agent}`;
     const text = {
-      attract: `The ${driver ? "evolved driver" : `agent ${agent}`} drives on track ${seed}. Press an arrow key to race it.`,
+      attract: `The ${name} drives on track ${seed}. Press an arrow key to race it.`,
       race: `You race on track ${seed}: ${driven}% of the lap, ${mine} points.`,
       paused: `Paused at ${driven}% of the lap.`,
       over: `The race is over: you ${mine}, the agent ${rival.score.toFixed(0)} points.`,
@@ -295,7 +296,8 @@ stad.start(async () => {
   }
 
   function showStart() {
-    showCard(`Beat the ${driver ? "evolved driver" : "agent"}`, "Press an arrow key, or touch the picture, to race it.");
+    const title = `Beat the ${driver ? "evolved driver" : "agent"}`;
+    showCard(title, "Press an arrow key, or touch the picture, to race it.");
   }
 
   function showEnd() {
