@@ -58,3 +58,30 @@ def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
     page.wait_for_function("stad.page.log.length === 0")
     evolve(page, 3)
     assert page.evaluate(LOG, 3) == resumed
+
+
+def test_the_evolved_driver_is_the_rival_in_the_race(evolved, opened):
+    address = evolved.get_attribute("#race", "href")
+    race = opened("race", address[address.index("#") :])
+    assert race.input_value("#agent") == "evolved"
+    text = address.rpartition("driver=")[2]
+    driver = race.evaluate("(text) => [...stad.unpackDriver(text, 32, 256)]", text)
+    assert driver == evolved.evaluate("stad.page.states.at(-1).mean")
+    race.select_option("#agent", "input")
+    assert "driver" not in race.evaluate("location.hash")
+
+
+def test_impatient_clicks_break_no_evolution(opened):
+    page = opened("evolve", SMALL, viewport={"width": 390, "height": 844})
+    page.evaluate(
+        """for (let i = 0; i < 60; i++) {
+            const buttons = [...document.querySelectorAll("#live button")]
+            buttons[(7 * i) % buttons.length].click()
+        }"""
+    )
+    page.wait_for_function("!stad.page.busy")
+    page.evaluate("document.querySelector('#restart').click()")
+    page.wait_for_function("stad.page.log.length === 0")
+    evolve(page, 1)
+    assert page.get_attribute("#live", "data-state") == "ready"
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390

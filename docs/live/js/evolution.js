@@ -57,7 +57,7 @@ globalThis.stad ??= {};
         this.ask();
         const state = this.tell(scores);
         if (state.checksum !== checksum)
-          throw new Error("What was kept comes from another browser or version. Start afresh.");
+          throw new Error("What was kept here comes from another version, so this begins afresh.");
         return state;
       });
     }

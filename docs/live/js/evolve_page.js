@@ -184,8 +184,14 @@ stad.start(async () => {
   });
 
   const kept = stad.evolveSettings.kept();
-  if (kept) bet = kept.bet;
-  await restart(kept?.settings ?? stad.evolveSettings.fromAddress(), kept?.log);
+  const first = kept?.settings ?? stad.evolveSettings.fromAddress();
+  bet = kept?.bet ?? bet;
+  try {
+    await restart(first, kept?.log);
+  } catch (error) {
+    await restart(first);
+    get("answer").textContent = error.message;
+  }
   stad.page = {
     view,
     get log() { return log; },
