@@ -19,7 +19,8 @@ globalThis.stad ??= {};
 
   stad.Evolution = class {
     /**
-     * @param {{seed: number, population: number, sigma: number, tracks: number}} settings
+     * @param {{seed: number, population: number, sigma: number, decay: number, tracks: number}}
+     *   settings with a `decay`, σ shrinks by this factor in each generation; 0 leaves it to CMA-ES
      * @param {number} inputs numbers that C sees
      */
     constructor(settings, inputs) {
@@ -48,6 +49,8 @@ globalThis.stad ??= {};
         this.points,
         scores.map((own) => -average(own)),
       );
+      const { sigma, decay } = this.settings;
+      if (decay) this.strategy.sigma = sigma * decay ** this.strategy.generation;
       return this.state();
     }
 

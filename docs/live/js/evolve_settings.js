@@ -4,7 +4,7 @@ globalThis.stad ??= {};
 
 stad.evolveSettings = {
   KEY: "stad-evolve", // in the browser's storage
-  NAMES: ["population", "sigma", "tracks", "sees", "agent", "seed"],
+  NAMES: ["population", "sigma", "decay", "tracks", "sees", "agent", "seed"],
 
   /** Settings from texts by their names, with the page's own for what is missing or wrong. */
   parse(texts) {
