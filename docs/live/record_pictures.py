@@ -37,10 +37,9 @@ def record(site: Path) -> None:
             page.wait_for_selector("#live[data-state=ready]")
             page.add_style_tag(content="#card { display: none }")
             page.locator(part).scroll_into_view_if_needed()
-            if name == "evolve":
-                page.click("#run")
-                page.wait_for_function("stad.page.log.some(({ laps }) => laps)", timeout=300_000)
-                page.click("#run")
+            while name == "evolve" and not page.evaluate("stad.page.log.at(-1)?.laps"):
+                page.click("#step")
+                page.wait_for_function("!stad.page.busy", timeout=300_000)
             page.wait_for_timeout(3000)  # until something has moved
             picture = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
             wide = min(picture.width, picture.height * SIZE[0] // SIZE[1])
