@@ -36,9 +36,10 @@ globalThis.stad ??= {};
    */
   stad.eigen = (matrix, n) => {
     const rows = Array.from({ length: n }, (_, i) => matrix.slice(i * n, (i + 1) * n));
-    const squares = rows.map((row) => dot(row, row));
+    let squares = [];
     for (let turned = true; turned;) {
       turned = false;
+      squares = rows.map((row) => dot(row, row));
       for (let i = 1; i < n; i++)
         for (let j = 0; j < i; j++) {
           const product = dot(rows[i], rows[j]);
@@ -47,7 +48,8 @@ globalThis.stad ??= {};
           const ratio = (squares[j] - squares[i]) / (2 * product);
           const tangent = (ratio < 0 ? -1 : 1) / (Math.abs(ratio) + Math.hypot(1, ratio));
           turn(rows[i], rows[j], tangent);
-          [squares[i], squares[j]] = [i, j].map((k) => dot(rows[k], rows[k]));
+          squares[i] -= tangent * product;
+          squares[j] += tangent * product;
         }
     }
     const values = squares.map(Math.sqrt);
@@ -60,7 +62,8 @@ globalThis.stad ??= {};
     const cosine = 1 / Math.hypot(1, tangent);
     const sine = cosine * tangent;
     for (let k = 0; k < a.length; k++) {
-      const [x, y] = [a[k], b[k]];
+      const x = a[k]; // two constants: destructuring is slow here
+      const y = b[k];
       a[k] = cosine * x - sine * y;
       b[k] = sine * x + cosine * y;
     }
