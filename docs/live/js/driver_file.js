@@ -9,6 +9,8 @@ globalThis.stad ??= {};
  * @returns {Promise<Blob>} safetensors
  */
 stad.controllerFile = async (parameters, metadata) => {
+  if (!globalThis.isSecureContext)
+    throw new Error("A download needs an address with https, or the page on your disk.");
   const encode = (text) => new TextEncoder().encode(text);
   const entry = ([name, value]) => `${JSON.stringify(name)}: ${JSON.stringify(value)}`;
   const json = (values) => `{${Object.entries(values).map(entry).join(", ")}}`; // as Python's

@@ -177,10 +177,13 @@ stad.start(async () => {
     bet = Number(target.value);
     showButtons();
   });
-  get("download").addEventListener("click", () => download().catch(stad.fail));
+  get("download").addEventListener("click", () =>
+    download().catch((error) => (get("answer").textContent = error.message)),
+  );
   addEventListener("hashchange", () => {
     const asked = stad.evolveSettings.fromAddress();
-    if (!stad.evolveSettings.equal(asked, settings)) restart(asked).catch(stad.fail);
+    if (stad.evolveSettings.asked && !stad.evolveSettings.equal(asked, settings))
+      restart(asked).catch(stad.fail);
   });
 
   const kept = stad.evolveSettings.kept();

@@ -25,6 +25,11 @@ stad.evolveSettings = {
     return this.parse(new Map(this.NAMES.map((name) => [name, stad.get(name).value])));
   },
 
+  /** Whether the address names settings, and not just a place on the page. */
+  get asked() {
+    return location.hash.includes("seed=");
+  },
+
   fromAddress() {
     return this.parse(new URLSearchParams(location.hash.slice(1)));
   },
@@ -51,8 +56,7 @@ stad.evolveSettings = {
   kept() {
     try {
       const kept = JSON.parse(localStorage.getItem(this.KEY));
-      const asked = location.hash ? this.fromAddress() : kept.settings;
-      return this.equal(asked, kept.settings) ? kept : null;
+      return !this.asked || this.equal(this.fromAddress(), kept.settings) ? kept : null;
     } catch {
       return null;
     }
