@@ -259,16 +259,17 @@ def run_folder(source: str | Path) -> Path:
     return PRETRAINED / source if source in shipped else Path(source)
 
 
-def load_agent(source: str | Path) -> Agent:
+def load_agent(source: str | Path, controller: str | Path | None = None) -> Agent:
     """Load a trained agent.
 
     Args:
         source: "frame", "input", "output" or "input_output" for the shipped agents, which are of
             one recipe (but the second iteration of "input" replayed no hard tracks); the name of
             another shipped agent; or the folder of a run, as a Path where it could be such a name.
+        controller: a file of another C for this V and M, as the browser saves it; None: its own.
 
     Raises:
-        FileNotFoundError: no such agent, or its run is not finished.
+        FileNotFoundError: no such agent or file, or the agent's run is not finished.
         ValueError: files that are damaged or do not belong together.
     """
     folder = run_folder(source)
@@ -277,8 +278,8 @@ def load_agent(source: str | Path) -> Agent:
             f"{str(source)!r} is no trained agent: expected {', '.join(shipped_agents())}, or the"
             " folder of a finished run of `python -m stad_lab train`"
         )
-    parameters, metadata = load_controller(folder / CONTROLLER_FILE)
+    parameters, metadata = load_controller(file := Path(controller or folder / CONTROLLER_FILE))
     world_model = load_world_model(folder)
     agent = Agent(world_model, parameters)
-    check_belongs(folder / CONTROLLER_FILE, metadata, **world_model.checksums)
+    check_belongs(file, metadata, **world_model.checksums)
     return agent

@@ -358,6 +358,10 @@ def test_a_controller_of_another_world_model_is_refused(quick_run, tmp_path):
     with pytest.raises(ValueError, match="made with another mdn_rnn than the one beside it"):
         load_agent(run)
     assert np.array_equal(load_controller(file)[0], parameters)
+    with pytest.raises(ValueError, match="made with another vae"):
+        load_agent("frame", run_folder("input") / "controller.safetensors")
+    own = load_agent("frame", run_folder("frame") / "controller.safetensors")
+    assert np.array_equal(own.parameters, load_agent("frame").parameters)
 
 
 def test_a_folder_that_is_made_again_is_read_again(tmp_path):

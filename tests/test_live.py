@@ -283,7 +283,7 @@ PRESS_ALL = """() => {
 
 
 def test_firefox_opens_every_page_and_dreams_as_python(firefox, live_pages, rng):
-    for name in ("latent", "nat", "evolution", "speeds", "dream"):
+    for name in ("latent", "nat", "evolution", "evolve", "speeds", "dream"):
         firefox.open((live_pages / f"{name}.html").as_uri())
         assert firefox.evaluate(READY) == ["ready", []]
         if name != "dream":

@@ -23,9 +23,12 @@ HERE = Path(__file__).parent
 PRETRAINED = HERE.parents[1] / "stad_lab" / "pretrained"
 CLAIMS = HERE.parents[1] / "stad_lab" / "replication" / "data" / "claims.json"
 AGENTS = ("frame", "input", "output", "input_output", "cropped_input")
-# What a worker runs: a page that is opened from the disk cannot give it a file.
+# What workers run: a page that is opened from the disk cannot give them a file.
 NETWORKS = ("layers", "vae", "mdn_rnn", "controller", "agent")
-WORKER = ("engine", *NETWORKS, "random", "hand", "race_worker")
+WORKERS = {
+    "race": ("engine", *NETWORKS, "random", "hand", "race_worker"),
+    "evolve": ("engine", *NETWORKS, "random", "cma_es", "evolution", "evolve_worker"),
+}
 
 
 def fold_decoder(vae: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -56,15 +59,18 @@ def encoded(content: bytes) -> str:
 
 
 def engine() -> dict[str, object]:
-    """The compiled engine: module and tables (gzip, base64), facts, and the worker's source."""
+    """The compiled engine: module and tables (gzip, base64), facts, and the workers' sources."""
     folder, js = HERE / "engine", HERE / "js"
     packed = {
         name: encoded(gzip.compress((folder / file).read_bytes(), mtime=0))
         for name, file in (("code", "engine.wasm"), ("tables", "tables.bin"))
     }
-    source = "\n".join((js / f"{name}.js").read_text(encoding="utf-8") for name in WORKER)
+    sources = {
+        worker: "\n".join((js / f"{name}.js").read_text(encoding="utf-8") for name in names)
+        for worker, names in WORKERS.items()
+    }
     facts = json.loads((folder / "engine.json").read_text(encoding="utf-8"))
-    return {**packed, "facts": facts, "source": source}
+    return {**packed, "facts": facts, "sources": sources}
 
 
 def study() -> dict[str, object]:

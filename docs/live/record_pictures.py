@@ -14,6 +14,7 @@ PICTURES = Path(__file__).parent / "pictures"
 SHOWN = {  # page -> what of it is shown
     "story": "[data-figure=dream] .four",
     "race": "#race",
+    "evolve": "#map",
     "dream": ".stage.dreaming",
     "latent": ".small",
     "nat": "#strip",
@@ -36,6 +37,9 @@ def record(site: Path) -> None:
             page.wait_for_selector("#live[data-state=ready]")
             page.add_style_tag(content="#card { display: none }")
             page.locator(part).scroll_into_view_if_needed()
+            while name == "evolve" and not page.evaluate("stad.page.log.at(-1)?.laps"):
+                page.click("#step")
+                page.wait_for_function("!stad.page.busy", timeout=300_000)
             page.wait_for_timeout(3000)  # until something has moved
             picture = Image.open(io.BytesIO(page.locator(part).screenshot())).convert("RGB")
             wide = min(picture.width, picture.height * SIZE[0] // SIZE[1])

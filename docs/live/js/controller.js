@@ -22,6 +22,25 @@ stad.control = (parameters, z, h) => {
   return Float32Array.of(raw[0], (raw[1] + 1) / 2, Math.max(0, raw[2]));
 };
 
+/**
+ * The parameters of a C for z and h, from those of a C that may see only one of them.
+ * @param {ArrayLike<number>} point 3 weights for each number that it sees, and 3 biases
+ * @param {number} z how many numbers z has
+ * @param {number} h how many numbers M's memory has
+ * @returns {Float64Array} the other weights are 0
+ */
+stad.expandController = (point, z, h) => {
+  const [seen, features] = [point.length / 3 - 1, z + h];
+  const begin = seen === h ? z : 0;
+  const parameters = new Float64Array(3 * features + 3);
+  for (let output = 0; output < 3; output++)
+    for (let i = 0; i < seen; i++)
+      parameters[output * features + begin + i] = point[output * seen + i];
+  for (let output = 0; output < 3; output++)
+    parameters[3 * features + output] = point[3 * seen + output];
+  return parameters;
+};
+
 /** Load the parameters of a shipped C: "frame", "input", "output" or "input_output". */
 stad.loadController = async (variant) =>
   (await stad.loadTensors(`controller_${variant}`)).parameters.data;

@@ -28,26 +28,11 @@ stad.start(async () => {
       paths: facts.points.map((count) => paths.slice(begin, (begin += count))),
     };
   });
+  const MARGIN = 0.06; // of the map, share of its width
   let moment = 0; // of the dot, in points of the path
 
   function pairs(data) {
     return Array.from({ length: data.length / 2 }, (_, i) => [data[2 * i], data[2 * i + 1]]);
-  }
-
-  /** World units to pixels: the whole road and some grass around it; y points up. */
-  function projection({ road }, width) {
-    const [xs, ys] = [0, 1].map((k) => road.map((point) => point[k]));
-    const [left, right, low, high] = [
-      Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys),
-    ]; // prettier-ignore
-    const scale = width / (Math.max(right - left, high - low) + 50);
-    return {
-      scale,
-      place: ([x, y]) => [
-        width / 2 + scale * (x - (left + right) / 2),
-        width / 2 - scale * (y - (low + high) / 2),
-      ],
-    };
   }
 
   let background = null; // the road and all paths, painted once for a size, track and theme
@@ -58,7 +43,7 @@ stad.start(async () => {
     if (!cleared) return;
     const { context, width } = cleared;
     const track = tracks[which];
-    const { place } = projection(track, width);
+    const { place } = stad.projectMap(track.road, width, MARGIN * width);
     const key = [which, canvas.width, stad.color("--color-background-primary")].join();
     if (background?.key !== key) background = { key, picture: paintBackground(canvas, width) };
     context.drawImage(background.picture, 0, 0, width, width);
@@ -75,7 +60,7 @@ stad.start(async () => {
     const context = picture.getContext("2d");
     context.scale(canvas.width / width, canvas.width / width);
     const track = tracks[which];
-    const { place, scale } = projection(track, width);
+    const { place, scale } = stad.projectMap(track.road, width, MARGIN * width);
     context.lineJoin = "round";
     const road = [...track.road, track.road[0]].map(place);
     stad.strokeLine(context, road, "#8a8a8a", 2 * run.half_width * scale);

@@ -5,37 +5,39 @@ stad.start(async () => {
   const get = stad.get;
   const AGENTS = ["frame", "input", "output", "input_output", "cropped_input"];
   const [ORANGE, BLUE, PURPLE] = ["#E69F00", "#0072B2", "#CC79A7"];
+  const SIZES = [32, 256]; // how many numbers z and h have
   const [FIELD, VIEW] = [333, 62]; // world units: half the field, and the height of the picture
-  const lacking = whatIsMissing();
+  const lacking = stad.whatIsMissing();
   if (lacking) throw new Error(lacking);
 
   let [track, state, before, arrived] = [null, null, null, 0];
   let [best, asleep, sleptAt] = [readBest(), false, null];
   let seen = true; // whether enough of the picture is in the window
-  let { seed, agent } = readAddress();
+  let { seed, agent, driver } = readAddress();
   const held = new Map();
   const worker = await startWorker();
-  get("agent").value = agent;
+  const evolved = driver && { driver, agent };
+  if (evolved) get("agent").append(new Option("evolved driver", "evolved"));
+  get("agent").value = evolved ? "evolved" : agent;
 
   // --- The worker ---------------------------------------------------------------------------------
 
   async function startWorker() {
-    const { code, tables, facts, source } = await stad.load("engine");
-    const url = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
-    const found = new Worker(url);
-    found.addEventListener("message", ({ data }) => receive(data));
-    found.addEventListener("error", (event) => stad.fail(new Error(event.message)));
-    const bytes = await Promise.all([code, tables].map(stad.unpack));
-    found.postMessage({ type: "load", code: bytes[0], facts, tables: bytes[1] });
-    return found;
+    const { workers, engine } = await stad.startWorkers("race", 1);
+    workers[0].addEventListener("message", ({ data }) => receive(data));
+    workers[0].postMessage({ type: "load", ...engine });
+    return workers[0];
   }
 
   /** Give the worker the networks of an agent. */
   async function choose(name) {
+    const own = driver;
     const names = [`vae_${name}`, `mdn_rnn_${name}`, `controller_${name}`];
     const [vae, mdnRnn, c] = await Promise.all(names.map(stad.loadTensors));
-    if (name !== agent) return; // another one was chosen meanwhile
-    const controller = Float64Array.from(c.parameters.data);
+    if (name !== agent || own !== driver) return; // another one was chosen meanwhile
+    const controller = own
+      ? stad.expandController(own, ...SIZES)
+      : Float64Array.from(c.parameters.data);
     const networks = { vae, mdnRnn, controller, cropBar: name.startsWith("cropped") };
     worker.postMessage({ type: "choose", networks });
   }
@@ -268,8 +270,9 @@ stad.start(async () => {
     const time = phase === "attract" ? rival.frames : you.frames;
     set("time", `${seconds(time)} s`);
     const driven = Math.round(100 * you.tiles);
+    const name = driver ? "evolved driver" : `agent ${agent}`;
     const text = {
-      attract: `The agent ${agent} drives on track ${seed}. Press an arrow key to race it.`,
+      attract: `The ${name} drives on track ${seed}. Press an arrow key to race it.`,
       race: `You race on track ${seed}: ${driven}% of the lap, ${mine} points.`,
       paused: `Paused at ${driven}% of the lap.`,
       over: `The race is over: you ${mine}, the agent ${rival.score.toFixed(0)} points.`,
@@ -299,7 +302,8 @@ stad.start(async () => {
   }
 
   function showStart() {
-    showCard("Beat the agent", "Press an arrow key, or touch the picture, to race it.");
+    const title = `Beat the ${driver ? "evolved driver" : "agent"}`;
+    showCard(title, "Press an arrow key, or touch the picture, to race it.");
   }
 
   function showEnd() {
@@ -342,12 +346,14 @@ stad.start(async () => {
     const asked = new URLSearchParams(location.hash.slice(1));
     const [wanted, number] = [asked.get("agent"), asked.get("track")];
     const found = /^\d{1,9}$/.test(number ?? "") ? Number(number) : 5;
-    return { seed: found, agent: AGENTS.includes(wanted) ? wanted : "frame" };
+    const own = stad.unpackDriver(asked.get("driver") ?? "", ...SIZES); // evolved by the reader
+    return { seed: found, agent: AGENTS.includes(wanted) ? wanted : "frame", driver: own };
   }
 
   /** Note what the reader has chosen, so that the address shows this race to others, too. */
   function writeAddress() {
-    history.replaceState(null, "", `#track=${seed}&agent=${agent}`);
+    const own = driver ? `&driver=${stad.packDriver(driver)}` : "";
+    history.replaceState(null, "", `#track=${seed}&agent=${agent}${own}`);
   }
 
   function drive(newSeed) {
@@ -495,7 +501,8 @@ stad.start(async () => {
     setAuto(get("auto").getAttribute("aria-pressed") === "false"),
   );
   get("agent").addEventListener("change", ({ target }) => {
-    agent = target.value;
+    const chosen = target.value === "evolved" ? evolved : { driver: null, agent: target.value };
+    ({ driver, agent } = chosen);
     writeAddress();
     choose(agent).catch(stad.fail);
   });
@@ -512,27 +519,14 @@ stad.start(async () => {
   addEventListener("hashchange", () => {
     if (!location.hash.includes("track=")) return; // another place of the page
     const asked = readAddress();
+    const texts = [asked, evolved ?? {}].map((one) => stad.packDriver(one.driver ?? []));
+    if (asked.driver && texts[0] !== texts[1]) return location.reload();
     if (asked.agent !== agent) {
       agent = get("agent").value = asked.agent;
       choose(agent).catch(stad.fail);
     }
     if (asked.seed !== seed) drive(asked.seed);
   });
-
-  function whatIsMissing() {
-    if (typeof WebAssembly !== "object") return "It needs WebAssembly, which this browser lacks.";
-    if (typeof Worker === "undefined") return "It needs workers, which this browser lacks.";
-    if (typeof DecompressionStream === "undefined")
-      return "It needs a newer browser, with DecompressionStream.";
-    // A module with one SIMD instruction.
-    const simd = [
-      0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253,
-      15, 253, 98, 11,
-    ];
-    if (!WebAssembly.validate(Uint8Array.from(simd)))
-      return "It needs WebAssembly SIMD, which this browser lacks.";
-    return null;
-  }
 
   await choose(agent);
   drive(seed);

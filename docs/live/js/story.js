@@ -101,21 +101,4 @@ globalThis.stad ??= {};
     const [vae, mdnRnn, parameters] = await drivers.get(name);
     return new stad.Agent(vae, mdnRnn, Float64Array.from(parameters));
   };
-
-  /** A function from world units to pixels of a square map that holds all of these points. */
-  stad.projectMap = (points, width, margin = 14) => {
-    const [xs, ys] = [0, 1].map((axis) => points.map((point) => point[axis]));
-    const [left, right] = [Math.min(...xs), Math.max(...xs)];
-    const [low, high] = [Math.min(...ys), Math.max(...ys)];
-    const scale = (width - 2 * margin) / Math.max(right - left, high - low);
-    const place = ([x, y]) => [
-      width / 2 + (x - (left + right) / 2) * scale,
-      width / 2 - (y - (low + high) / 2) * scale,
-    ];
-    return { place, scale };
-  };
-
-  /** The middle of each tile of a track. */
-  stad.middleLine = (track) =>
-    Array.from({ length: track.count }, (_, i) => [track.path[4 * i + 2], track.path[4 * i + 3]]);
 }

@@ -1,0 +1,204 @@
+"use strict";
+// The page "Evolve a driver": asks CMA-ES for a generation, lets the workers drive it, and shows it.
+
+stad.start(async () => {
+  const get = stad.get;
+  const LIMITS = { patience: 50, longest: stad.LONGEST }; // frames
+  const [Z, H] = [32, 256]; // how many numbers the shipped V and M have
+  const INPUTS = { z: Z, h: H, both: Z + H };
+  const lacking = stad.whatIsMissing();
+  if (lacking) throw new Error(lacking);
+
+  const crew = await stad.Crew.start();
+  const view = new stad.EvolveView();
+  // `log` is all that has to be kept: `states`, one more than generations, follow from it.
+  let [settings, log, states, bet] = [null, [], [], 8];
+  let upcoming = null; // what CMA-ES has asked for, and nobody has driven yet
+  let finished = null; // the candidates that have driven last, and where they came from
+  let [wanted, run] = [0, 0]; // generations to drive; a number for each fresh start
+  let [paused, idle] = [null, 0]; // since when, and for how long in this generation; milliseconds
+  let [driving, beginning] = [null, null]; // promises, while this goes on
+  let identity = null; // of V and M, for the file
+
+  // --- One generation -----------------------------------------------------------------------------
+
+  async function drive() {
+    const own = run;
+    await beginning;
+    while (wanted > 0 && own === run) {
+      wanted -= 1;
+      await generation(own);
+    }
+  }
+
+  async function generation(own) {
+    const [began, { tracks, points, ...before }] = [performance.now(), upcoming];
+    idle = 0;
+    const drivers = [...points, before.mean]; // the mean drives along, but does not count
+    const driven = drivers.map(() => []);
+    for (const [number, seed] of tracks.entries()) {
+      const track = await crew.lead("track", { seed });
+      if (own !== run) return;
+      const name = tracks.length > 1 ? `, track ${number + 1}` : "";
+      view.begin(track, drivers.length, `Generation ${log.length + 1}${name}.`);
+      const found = await crew.drive(drivers, seed, LIMITS, (car, at) => view.map.move(car, at));
+      if (!found || own !== run) return; // a fresh start meanwhile
+      found.forEach((one, i) => driven[i].push(one));
+    }
+    const mean = driven.pop();
+    const scores = driven.map((one) => one.map(({ score }) => score));
+    const state = await crew.lead("tell", { scores });
+    const next = await crew.lead("ask");
+    if (own !== run) return;
+    log.push({
+      scores,
+      mean: mean.map(({ score }) => score),
+      laps: driven.filter((one) => one.some(({ lap }) => lap)).length,
+      meanLap: mean.every(({ lap }) => lap),
+      frames: [...driven, mean].flat().reduce((total, { frames }) => total + frames, 0),
+      seconds: (performance.now() - began - idle) / 1000,
+      checksum: state.checksum,
+    });
+    [finished, upcoming] = [{ points, before }, next];
+    states.push(state);
+    stad.evolveSettings.keep({ settings, log, bet });
+    show();
+    stad.announce(get("summary").textContent);
+  }
+
+  /** Begin an evolution afresh, or go on with a kept log. */
+  async function begin(chosen, kept = []) {
+    const [own, before] = [++run, driving];
+    [settings, wanted, paused] = [chosen, 0, null];
+    await crew.stop();
+    await before;
+    if (own !== run) return;
+    await chooseNetworks();
+    const inputs = INPUTS[settings.sees];
+    const found = await crew.lead("evolve", { settings, inputs, log: kept });
+    const next = await crew.lead("ask");
+    const track = await crew.lead("track", { seed: next.tracks[0] });
+    if (own !== run) return;
+    [log, states, upcoming, finished] = [kept, found, next, null];
+    view.begin(track, settings.population + 1, "");
+    stad.evolveSettings.show(settings);
+    show();
+  }
+
+  function restart(chosen, kept) {
+    beginning = begin(chosen, kept);
+    return beginning;
+  }
+
+  /** Give the workers V and, if C sees its memory, M. */
+  async function chooseNetworks() {
+    const { agent, sees } = settings;
+    const [vae, mdnRnn, c] = await Promise.all([
+      stad.loadTensors(`vae_${agent}`),
+      sees === "z" ? null : stad.loadTensors(`mdn_rnn_${agent}`),
+      stad.load(`controller_${agent}`),
+    ]);
+    const networks = { vae, mdnRnn };
+    await crew.callAll("choose", { ...networks, cropBar: agent.startsWith("cropped") });
+    const { variant, vae: v, mdn_rnn: m } = stad.readMetadata(await stad.decodeBase64(c));
+    identity = { variant, vae: v, mdn_rnn: m };
+  }
+
+  // --- Pictures, words and buttons ----------------------------------------------------------------
+
+  function show() {
+    const inputs = INPUTS[settings.sees];
+    view.show({ log, states, finished, bet, settings, inputs, workers: crew.workers.length });
+    showButtons();
+  }
+
+  function showButtons() {
+    const begun = log.length > 0 || driving !== null;
+    get("run").textContent = driving && paused === null ? "Pause" : begun ? "Go on" : "Start";
+    get("bet-value").textContent = get("bet").value = bet;
+    get("bet").disabled = begun;
+    get("download").disabled = get("race").hidden = log.length === 0;
+    const { seed, agent } = settings;
+    const driver = stad.packDriver(states.at(-1).mean);
+    get("race").href = `race.html#track=${seed}&agent=${agent}&driver=${driver}`;
+  }
+
+  let drawn = 0;
+  function draw(now) {
+    requestAnimationFrame(draw);
+    if (!driving || paused !== null || document.hidden) return;
+    if (stad.prefersStill() && now - drawn < 1000) return; // stills instead of motion
+    drawn = now;
+    view.map.draw();
+  }
+
+  // --- Controls -----------------------------------------------------------------------------------
+
+  /** Drive so many more generations. */
+  function go(count) {
+    wanted = count;
+    setPaused(false);
+    driving ??= drive()
+      .catch(stad.fail)
+      .finally(() => {
+        driving = null;
+        showButtons();
+      });
+    showButtons();
+  }
+
+  function setPaused(on) {
+    if (!on && paused !== null) idle += performance.now() - paused;
+    paused = on ? performance.now() : null;
+    crew.pause(on);
+    showButtons();
+  }
+
+  async function download() {
+    const parameters = stad.expandController(states.at(-1).mean, Z, H);
+    const facts = { ...identity, generation: log.length, seed: settings.seed };
+    const link = document.createElement("a");
+    link.href = URL.createObjectURL(await stad.controllerFile(parameters, facts));
+    link.download = "driver.safetensors";
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 10_000); // when it has been saved
+  }
+
+  get("run").addEventListener("click", () => {
+    if (driving && paused === null) setPaused(true);
+    else go(Infinity);
+  });
+  get("step").addEventListener("click", () => go(driving ? 0 : 1)); // or no more than this one
+  get("restart").addEventListener("click", () =>
+    restart(stad.evolveSettings.fromControls()).catch(stad.fail),
+  );
+  get("bet").addEventListener("input", ({ target }) => {
+    bet = Number(target.value);
+    showButtons();
+  });
+  get("download").addEventListener("click", () =>
+    download().catch((error) => (get("answer").textContent = error.message)),
+  );
+  addEventListener("hashchange", () => {
+    const asked = stad.evolveSettings.fromAddress();
+    if (stad.evolveSettings.asked && !stad.evolveSettings.equal(asked, settings))
+      restart(asked).catch(stad.fail);
+  });
+
+  const kept = stad.evolveSettings.kept();
+  const first = kept?.settings ?? stad.evolveSettings.fromAddress();
+  bet = kept?.bet ?? bet;
+  try {
+    await restart(first, kept?.log);
+  } catch (error) {
+    await restart(first);
+    get("answer").textContent = error.message;
+  }
+  stad.page = {
+    view,
+    get log() { return log; },
+    get states() { return states; },
+    get busy() { return driving !== null; },
+  }; // prettier-ignore
+  requestAnimationFrame(draw);
+});

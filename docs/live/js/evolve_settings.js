@@ -1,0 +1,64 @@
+"use strict";
+// What the reader of "Evolve a driver" has chosen: in the controls, in the address, and kept.
+globalThis.stad ??= {};
+
+stad.evolveSettings = {
+  KEY: "stad-evolve", // in the browser's storage
+  NAMES: ["population", "sigma", "decay", "tracks", "sees", "agent", "seed"],
+
+  /** Settings from texts by their names, with the page's own for what is missing or wrong. */
+  parse(texts) {
+    const found = {};
+    for (const name of this.NAMES) {
+      const { options, dataset } = stad.get(name);
+      const text = texts.get(name) ?? "";
+      const valid = options
+        ? [...options].some((one) => one.value === text)
+        : /^\d{1,9}$/.test(text);
+      const value = valid ? text : dataset.first;
+      found[name] = name === "sees" || name === "agent" ? value : Number(value);
+    }
+    return found;
+  },
+
+  fromControls() {
+    return this.parse(new Map(this.NAMES.map((name) => [name, stad.get(name).value])));
+  },
+
+  /** Whether the address names settings, and not just a place on the page. */
+  get asked() {
+    return location.hash.includes("seed=");
+  },
+
+  fromAddress() {
+    return this.parse(new URLSearchParams(location.hash.slice(1)));
+  },
+
+  /** Show settings in the controls and in the address, which leads others to the same evolution. */
+  show(settings) {
+    for (const name of this.NAMES) stad.get(name).value = settings[name];
+    history.replaceState(null, "", `#${new URLSearchParams(settings)}`);
+  },
+
+  equal(one, other) {
+    return this.NAMES.every((name) => one[name] === other?.[name]);
+  },
+
+  keep(state) {
+    try {
+      localStorage.setItem(this.KEY, JSON.stringify(state));
+    } catch {
+      // without storage, or when it is full, nothing is kept
+    }
+  },
+
+  /** What was kept, if it has these settings, or if the address asks for none. */
+  kept() {
+    try {
+      const kept = JSON.parse(localStorage.getItem(this.KEY));
+      return !this.asked || this.equal(this.fromAddress(), kept.settings) ? kept : null;
+    } catch {
+      return null;
+    }
+  },
+};

@@ -1,0 +1,87 @@
+"""The page that evolves a driver: in a Chromium, from the disk."""
+
+import numpy as np
+import pytest
+
+from stad_lab.agent import drive, load_agent
+from stad_lab.io.weights import load_controller
+
+SMALL = "#seed=3&population=12&agent=frame"
+LOG = """(count) => stad.page.log.slice(0, count).map(({ scores, mean, laps, checksum }) =>
+    ({ scores, mean, laps, checksum }))"""
+TILE = 1000 / 200  # points; a track has more tiles
+
+
+def evolve(page, generations):
+    """Drive so many more generations, one by one."""
+    for _ in range(generations):
+        done = page.evaluate("stad.page.log.length")
+        page.press("#step", "Enter")
+        page.wait_for_function(f"stad.page.log.length > {done} && !stad.page.busy")
+
+
+@pytest.fixture
+def evolved(opened):
+    """A page after two small generations."""
+    page = opened("evolve", SMALL)
+    evolve(page, 2)
+    return page
+
+
+def test_a_driver_from_the_page_scores_the_same_in_python(evolved, tmp_path):
+    with evolved.expect_download() as started:
+        evolved.click("#download")
+    file = tmp_path / started.value.suggested_filename
+    started.value.save_as(file)
+    parameters, metadata = load_controller(file)
+    assert np.array_equal(parameters[:32], evolved.evaluate("stad.page.states.at(-1).mean")[:32])
+    assert metadata["generation"] == 2 and metadata["seed"] == 3
+    # The next generation lets this mean drive along.
+    evolve(evolved, 1)
+    (page_score,) = evolved.evaluate("stad.page.log[2].mean")
+    track = evolved.evaluate("stad.page.view.map.track.seed")
+    agent = load_agent("frame", file)
+    (score,) = drive(agent, [track], patience=50).returns
+    # z differs by rounding, so a car may touch a tile a moment earlier or later.
+    assert score == pytest.approx(page_score, abs=2 * TILE)
+
+
+def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
+    page = evolved
+    page.reload()
+    page.wait_for_selector("#live[data-state=ready]")
+    assert page.evaluate("stad.page.log.length") == 2
+    evolve(page, 1)
+    resumed = page.evaluate(LOG, 3)
+    page.click("summary")
+    page.click("#restart")
+    page.wait_for_function("stad.page.log.length === 0")
+    evolve(page, 3)
+    assert page.evaluate(LOG, 3) == resumed
+
+
+def test_the_evolved_driver_is_the_rival_in_the_race(evolved, opened):
+    address = evolved.get_attribute("#race", "href")
+    race = opened("race", address[address.index("#") :])
+    assert race.input_value("#agent") == "evolved"
+    text = address.rpartition("driver=")[2]
+    driver = race.evaluate("(text) => [...stad.unpackDriver(text, 32, 256)]", text)
+    assert driver == evolved.evaluate("stad.page.states.at(-1).mean")
+    race.select_option("#agent", "input")
+    assert "driver" not in race.evaluate("location.hash")
+
+
+def test_impatient_clicks_break_no_evolution(opened):
+    page = opened("evolve", SMALL, viewport={"width": 390, "height": 844})
+    page.evaluate(
+        """for (let i = 0; i < 60; i++) {
+            const buttons = [...document.querySelectorAll("#live button")]
+            buttons[(7 * i) % buttons.length].click()
+        }"""
+    )
+    page.wait_for_function("!stad.page.busy")
+    page.evaluate("document.querySelector('#restart').click()")
+    page.wait_for_function("stad.page.log.length === 0")
+    evolve(page, 1)
+    assert page.get_attribute("#live", "data-state") == "ready"
+    assert page.evaluate("document.documentElement.scrollWidth") <= 390
