@@ -120,7 +120,8 @@ def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
 
 def to_state(memory: np.ndarray | None) -> State | None:
     """h and c, float32 (2, batch, hidden_size), as the LSTM takes them: copies; None stays None."""
-    return memory if memory is None else tuple(torch.tensor(part)[None] for part in memory)
+    state = None if memory is None else torch.tensor(memory)
+    return None if state is None else (state[:1], state[1:])
 
 
 def check_temperature(temperature: float) -> None:
