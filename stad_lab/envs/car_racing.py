@@ -6,6 +6,7 @@ differs by less than 0.3 of 255 on average, in the usual colours. To drive many 
 """
 
 import inspect
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -39,8 +40,8 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
     Raises:
         ValueError: an option that the environment does not have, or another value of it.
     """
-    options = inspect.signature(CarRacing if fast else reference.CarRacing).parameters
-    options = [*options, "max_episode_steps", "disable_env_checker"]
+    signature = inspect.signature(CarRacing if fast else reference.CarRacing)
+    options = [*signature.parameters, "max_episode_steps", "disable_env_checker"]
     if unknown := [name for name in kwargs if name not in options]:
         raise ValueError(
             f"make_env: unknown {', '.join(unknown)}; choose from {', '.join(options)}. The seed of"
@@ -60,7 +61,7 @@ def place_car(
         env: from `make_env`, fast or not.
         tile, speed, turn, offset: as for `Cars.place`.
     """
-    racing = env.unwrapped
+    racing: Any = env.unwrapped
     if isinstance(racing, CarRacing):
         return racing.place(tile, speed=speed, turn=turn, offset=offset)
     heading, x, y = pose_on(racing.track, tile, turn, offset)
@@ -135,7 +136,7 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         self.render_mode, self.continuous = render_mode, continuous
         self.view, self.frame_skip = View(observes, size, bar), check_skip(frame_skip)
         self.observation_space, self.action_space = self.view.space, action_space(continuous)
-        self.cars: Cars | None = Cars(1, "observation", bar, *rules, track)
+        self.cars = Cars(1, "observation", bar, *rules, track)
         self._window: Window | None = None
         self._started = False
 
@@ -206,7 +207,8 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         if self._window is not None:
             self._window.close()
         self.view.close()
-        self.cars = self._window = None
+        self._window = None
+        self.cars = None  # type: ignore[assignment]  # closed
 
     def _show(self) -> None:
         if self.render_mode == "human":

@@ -69,7 +69,7 @@ class Cars:
         self.domain_randomize = domain_randomize
         self.own_track = None if track is None else make_own_track(track)
         self.cars, self.roads = np.zeros(count, physics.CAR), np.zeros(count, physics.ROAD)
-        self.tracks: list[Track | None] = [None] * count
+        self.tracks: list[Track] = [None] * count  # type: ignore[list-item]  # until reset
         randoms = [seeding.np_random() for _ in range(count)]
         self.randoms, self.seeds = map(list, zip(*randoms, strict=True))
         self.colors = {
@@ -87,7 +87,7 @@ class Cars:
     def reset(
         self,
         seeds: Sequence[int | None] | None = None,
-        which: Sequence[int] | None = None,
+        which: Sequence[int] | np.ndarray | None = None,
         randomize: bool = True,
     ) -> None:
         """Begin new episodes.
@@ -219,7 +219,7 @@ def check_rules(
 
 
 def pose_on(
-    path: Sequence, tile: int, turn: float = 0.0, offset: float = 0.0
+    path: Sequence | np.ndarray, tile: int, turn: float = 0.0, offset: float = 0.0
 ) -> tuple[float, float, float]:
     """Heading, x and y of a car that `Cars.place` puts on a tile of a track's centre line."""
     _, beta, x, y = path[tile % len(path)]

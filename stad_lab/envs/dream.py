@@ -6,15 +6,13 @@ CarRacing, M predicts neither reward nor the end of an episode: the reward is al
 ends after `max_frames`.
 """
 
-from typing import ClassVar
-
 import gymnasium as gym
 import numpy as np
 import torch
 
 from stad_lab.models.controller import ACTION_SIZE
-from stad_lab.models.mdn_rnn import check_temperature
-from stad_lab.models.vae import to_uint8
+from stad_lab.models.mdn_rnn import MDNRNN, check_temperature
+from stad_lab.models.vae import VAE, to_uint8
 
 
 class DreamEnv(gym.Env):
@@ -34,12 +32,12 @@ class DreamEnv(gym.Env):
         render_mode: "rgb_array" for pictures from `render()`, or None.
     """
 
-    metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self,
-        vae: torch.nn.Module,
-        mdn_rnn: torch.nn.Module,
+        vae: VAE,
+        mdn_rnn: MDNRNN,
         temperature: float = 1.0,
         max_frames: int = 1000,
         render_mode: str | None = None,
@@ -52,7 +50,7 @@ class DreamEnv(gym.Env):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (vae.latent_size,), np.float32)
         lowest = np.array([-1, 0, 0], np.float32)
         self.action_space = gym.spaces.Box(lowest, np.ones(ACTION_SIZE, np.float32))
-        self.latents: torch.Tensor | None = None
+        self.latents: torch.Tensor = None  # type: ignore[assignment]  # until reset
 
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
@@ -77,7 +75,7 @@ class DreamEnv(gym.Env):
         self.state = options.get("state") or (zeros, zeros.clone())
         for part in self.state:
             check_numbers("memory", part, tuple(zeros.shape), "h and c of one car")
-        self.prediction, self.frames = None, 0
+        self.frames = 0
         return self.latents.numpy().copy(), {"hidden": self.hidden}
 
     @property
@@ -92,10 +90,10 @@ class DreamEnv(gym.Env):
         action = np.asarray(action, np.float32)
         if action.shape != (ACTION_SIZE,) or not np.isfinite(action).all():
             raise ValueError(f"action {action}: expected finite steering, gas and brake")
-        self.prediction, self.state = self.mdn_rnn(
+        prediction, self.state = self.mdn_rnn(
             self.latents[None, None], torch.from_numpy(action)[None, None], self.state
         )
-        self.latents = self.prediction.sample(self.temperature, self.generator)[0, 0]
+        self.latents = prediction.sample(self.temperature, self.generator)[0, 0]
         self.frames += 1
         ended = self.frames >= self.max_frames
         return self.latents.numpy().copy(), 0.0, False, ended, {"hidden": self.hidden}

@@ -19,8 +19,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from stad_lab.envs.dream import DreamEnv
-from stad_lab.models.mdn_rnn import Mixture
-from stad_lab.models.vae import to_uint8
+from stad_lab.models.mdn_rnn import MDNRNN, Mixture
+from stad_lab.models.vae import VAE, to_uint8
 
 
 class DreamVector(gym.vector.VectorEnv):
@@ -37,8 +37,8 @@ class DreamVector(gym.vector.VectorEnv):
 
     def __init__(
         self,
-        vae: torch.nn.Module,
-        mdn_rnn: torch.nn.Module,
+        vae: VAE,
+        mdn_rnn: MDNRNN,
         num_envs: int = 1,
         temperature: float = 1.0,
         max_frames: int = 1000,
@@ -75,7 +75,7 @@ class DreamVector(gym.vector.VectorEnv):
             raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), at first all")
         if seed is None or isinstance(seed, int | np.integer):
             seed = [None if seed is None else int(seed) + n for n in range(self.num_envs)]
-        for number in np.flatnonzero(mask):
+        for number in np.flatnonzero(mask).tolist():
             self.dreams[number].reset(seed=seed[number])
         self._ended[mask], self._begun = False, True
         return self._observations(), self._info()
@@ -128,9 +128,9 @@ class DreamVector(gym.vector.VectorEnv):
         )
         for place, dream in enumerate(dreams):
             own = slice(place, place + 1)
-            dream.prediction = Mixture(*(part[own] for part in prediction))
+            predicted = Mixture(*(part[own] for part in prediction))
             dream.state = tuple(part[:, own] for part in after)
-            dream.latents = dream.prediction.sample(self.temperature, dream.generator)[0, 0]
+            dream.latents = predicted.sample(self.temperature, dream.generator)[0, 0]
             dream.frames += 1
 
     def _observations(self) -> np.ndarray:

@@ -102,7 +102,8 @@ class CarRacingVector(gym.vector.VectorEnv):
         if len(whole) != self.num_envs or not all(whole):
             raise ValueError(f"seed={seed!r}: expected {self.num_envs} numbers 0, 1, ..., or one")
         which = np.flatnonzero(mask)
-        self.cars.reset([seed[car] for car in which], which, options.get("randomize", True))
+        seeds = [one for one, asked in zip(seed, mask, strict=True) if asked]
+        self.cars.reset(seeds, which, options.get("randomize", True))
         self._ended[which], self._begun = False, True
         return self.view.look(self.cars), {}
 
@@ -142,14 +143,14 @@ class CarRacingVector(gym.vector.VectorEnv):
             info = self._begin_again(observations, info)
         return observations, rewards, terminated, truncated, info
 
-    @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:
+    @property  # type: ignore[misc]  # as SyncVectorEnv
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The random numbers of each car, as `SyncVectorEnv` gives them."""
         self._check_open()
         return tuple(self.cars.randoms)
 
     @property
-    def np_random_seed(self) -> tuple[int, ...]:
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The last seed of each car."""
         self._check_open()
         return tuple(self.cars.seeds)
@@ -157,7 +158,7 @@ class CarRacingVector(gym.vector.VectorEnv):
     def close_extras(self, **kwargs) -> None:
         """Release the memory of the tracks."""
         self.view.close()
-        self.cars = None
+        self.cars = None  # type: ignore[assignment]  # closed
 
     def _check_open(self) -> None:
         if self.closed:
