@@ -31,6 +31,7 @@ SOURCES = ("metadata.yaml", "bibliography.bib")
 TEMPLATE = ("article.tex", "header.tex", "rescience.cls", "article.py", "yaml-to-latex.py")
 FONTS = ("roboto", "source-code-pro", "source-sans-pro", "source-serif-pro")
 FIGURES = ("study1", "study1_scores")
+LEFT_OUT = ("test", "SD of pairs", "p")  # columns, so that the others can be read
 TABLES: dict[str, Callable[[dict], str]] = {
     "paper": blocks.paper_table,
     "tests": lambda claims: blocks.comparisons_table(claims["study1"]),
@@ -55,11 +56,12 @@ def escape(text: str) -> str:
 
 
 def tabular(markdown: str) -> str:
-    """A table in Markdown as LaTeX, as wide as the text at most."""
+    """A table in Markdown, without LEFT_OUT, as LaTeX, as wide as the text at most."""
     cells = [line.strip("| ").split(" | ") for line in markdown.splitlines()]
-    del cells[1]
+    kept = [place for place, name in enumerate(cells[0]) if name not in LEFT_OUT]
+    cells = [[line[place] for place in kept] for line in (cells[0], *cells[2:])]
     head, *lines = (" & ".join(map(escape, line)) + r" \\" for line in cells)
-    columns = "l" * max(map(len, cells))
+    columns = "l" * len(kept)
     body = [rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *lines, r"\hline"]
     fit = r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%"
     return "\n".join([fit, *body, r"\end{tabular}}"])
