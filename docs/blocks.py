@@ -274,6 +274,27 @@ def card(claims: dict, name: str) -> str:
     return table(("measure", "value"), lines)
 
 
+def front_matter(claims: dict, name: str) -> str:
+    """A card's metadata in the form of model hubs: YAML, with the recorded scores of an agent."""
+    tags = ("reinforcement-learning", "world-models", "vae", "mdn-rnn", "cma-es", "CarRacing-v3")
+    lines = ["license: mit", "library_name: stad_lab", "tags:", *(f"  - {tag}" for tag in tags)]
+    if one := claims["agents"].get(name):
+        scores = {
+            "mean_reward": f"{one['mean']:.2f} +/- {one['standard_deviation']:.2f}",
+            "minimum_reward": f"{one['minimum']:.2f}",
+            "tenth_percentile_reward": f"{one['tenth_percentile']:.2f}",
+        }
+        lines += [
+            "pipeline_tag: reinforcement-learning", "model-index:", f"  - name: {name}",
+            "    results:", "      - task:", "          type: reinforcement-learning",
+            "        dataset:", "          type: CarRacing-v3",
+            "          name: CarRacing-v3, tracks 0 to 99", "        metrics:",
+        ]  # fmt: skip
+        for kind, value in scores.items():
+            lines += [f"          - type: {kind}", f"            value: {value}"]
+    return "\n".join(["---", *lines, "---", "", ""])
+
+
 def recipe(name: str) -> str:
     """The stages of a shipped agent's training, from its record."""
     record, lines = json.loads((PRETRAINED / name / "record.json").read_text("utf-8")), []

@@ -3,7 +3,8 @@
 With `--check` it changes nothing and names the stale pages. A page has markers,
 `<!-- claims: NAME -->...<!-- /claims -->`, and the text between them comes from claims.json. NAME
 is a key of BLOCKS, or the path of a number and its format: `agents/frame/mean:.1f`. The marker of
-a number must not begin a line, which Markdown would take for HTML.
+a number must not begin a line, which Markdown would take for HTML. A card of a network begins with
+metadata for model hubs, which are computed, too.
 """
 
 import argparse
@@ -11,13 +12,14 @@ import re
 import sys
 from pathlib import Path
 
-from blocks import BLOCKS, FIGURES, NUMBERS
+from blocks import BLOCKS, FIGURES, NUMBERS, front_matter
 from gallery import PICTURES
 
 from stad_lab.replication.claims import read_claims
 from stad_lab.viz.plots import to_png
 
 ROOT = Path(__file__).parent.parent
+CARDS = ROOT / "stad_lab" / "pretrained"
 MARKED = re.compile(r"(<!-- claims: ([^>]+?) -->)(.*?)(<!-- /claims -->)", re.S)
 
 
@@ -48,13 +50,16 @@ def pages() -> list[Path]:
     """All pages that may have markers."""
     docs = ROOT / "docs"
     found = [ROOT / "README.md", *sorted(docs.glob("*.md")), *sorted(docs.glob("live/*.md"))]
-    return found + sorted((ROOT / "stad_lab" / "pretrained").glob("*/README.md"))
+    return found + sorted(CARDS.glob("*/README.md"))
 
 
 def stale(claims: dict) -> dict[Path, str]:
     """The pages that differ from the data: file -> text as it should be."""
     texts = {file: file.read_text(encoding="utf-8") for file in pages()}
     filled = {file: fill(text, claims) for file, text in texts.items()}
+    for file in CARDS.glob("*/README.md"):
+        body = re.sub(r"\A---\n.*?\n---\n+", "", filled[file], flags=re.S)
+        filled[file] = front_matter(claims, file.parent.name) + body
     return {file: text for file, text in filled.items() if text != texts[file]}
 
 

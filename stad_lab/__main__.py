@@ -1,5 +1,6 @@
 """`python -m stad_lab`: the command line of `stad_lab.cli`."""
 
+import io
 import sys
 
 from stad_lab.streams import make_streams_last, open_missing_streams
@@ -13,7 +14,8 @@ if __name__ == "__main__":
     if sys.argv[1:] == ["check"]:  # it must run where the command line's own packages are missing
         from stad_lab.doctor import tell_environment
 
-        sys.stdout.reconfigure(errors="backslashreplace")  # for letters that a console lacks
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")  # for letters that a console lacks
         sys.exit(tell_environment())
     try:
         from stad_lab.cli import main

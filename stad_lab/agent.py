@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
@@ -55,10 +55,10 @@ class Agent:
     def reset(self) -> None:
         """Forget the past: every episode begins with this."""
         self.memory = FrameMemory(self.world_model.stride)
-        self.cars: np.ndarray | None = None  # which of the first step's cars still drive, (cars,)
-        self.state: np.ndarray | None = None
-        self.latents: np.ndarray | None = None
-        self.hidden: np.ndarray | None = None
+        self.cars: Any = None  # which of the first step's cars still drive, an array (cars,)
+        self.state: Any = None  # these are arrays from the first step on
+        self.latents: Any = None
+        self.hidden: Any = None
 
     def act(self, observation: np.ndarray) -> np.ndarray:
         """The action for one car: observation uint8 (96, 96, 3) -> float32 (3,).
@@ -68,7 +68,7 @@ class Agent:
         """
         return self.act_batch([to_frame(observation, self.world_model.crop_bar)])[0]
 
-    def act_batch(self, seen: Sequence[np.ndarray]) -> np.ndarray:
+    def act_batch(self, seen: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """The actions for a batch of cars: float32 (cars, 3). ValueError as `act`.
 
         Args:
@@ -197,7 +197,7 @@ def rollout(
     for name, value, least in (("max_frames", max_frames, 1), ("patience", patience, 0)):
         if not isinstance(value, int | np.integer) or value < least:
             raise ValueError(f"{name}={value!r}: expected at least {least}, a whole number")
-    returns, rewards = np.zeros(len(batch)), [[] for _ in range(len(batch))]
+    returns, rewards = np.zeros(len(batch)), [list[float]() for _ in range(len(batch))]
     last_tile = np.zeros(len(batch), int)  # the frame in which a car last reached a new tile
     driving = np.arange(len(batch))
     driver.reset()

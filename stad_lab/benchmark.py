@@ -19,9 +19,10 @@ import inspect
 import pstats
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
+from typing import Any
 
 import cv2
 import gymnasium as gym
@@ -57,7 +58,8 @@ GYMNASIUM, ENVPOOL = "Gymnasium", "EnvPool"
 CARS = 16  # in a batch
 V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, the first of them not timed
 
-Contenders = dict[str, Callable[[int], float]]  # name -> function of the round that gives a speed
+# Name -> function of the round that gives a speed.
+Contenders = Mapping[str, Callable[[int], float]]
 
 
 def benchmark(parts: list[str], rounds: int = 5, file: Path | None = None) -> dict:
@@ -79,7 +81,7 @@ def benchmark(parts: list[str], rounds: int = 5, file: Path | None = None) -> di
         known = f"choose from {', '.join(PARTS)}, with 1 round or more"
         raise ValueError(f"parts={unknown or list(parts)}, rounds={rounds}: {known}")
     command = f"python -m stad_lab benchmark --parts {' '.join(parts)} --rounds {rounds}"
-    result = {
+    result: dict[str, Any] = {
         "kind": "benchmark",
         "made_with": provenance(command) | {"trained_on": "cpu"},
         "rounds": rounds,
@@ -103,7 +105,7 @@ def take_turns(contenders: Contenders, rounds: int, label: str) -> dict:
     """
     for contender in contenders.values():
         contender(rounds)  # caches fill, memory is allocated
-    speeds = {name: [] for name in contenders}
+    speeds: dict[str, list[float]] = {name: [] for name in contenders}
     for number in tqdm(range(rounds), label, unit="round"):
         for name in list(contenders)[:: -1 if number % 2 else 1]:
             speeds[name].append(contenders[name](number))
@@ -136,7 +138,8 @@ def measure_parity(rounds: int) -> dict:
     with worker_processes(2) as executor:
         tasks = [(number,) for number in range(20)]
         episodes = run_in_order(executor, compare_pictures, tasks, "parity")
-    errors, table = np.concatenate([errors for errors, _ in episodes]), {}
+    errors = np.concatenate([errors for errors, _ in episodes])
+    table: dict[str, float] = {}
     for name, value in (("mean", errors.mean(axis=0)), ("worst picture", errors.max(axis=0))):
         table |= {f"{area}, {name}": float(own) for area, own in zip(AREAS, value, strict=True)}
     equal = all(equal for _, equal in episodes)
@@ -154,7 +157,9 @@ def measure_renderer(rounds: int) -> dict:
     vector, cars = CarRacingVector(CARS), Cars(CARS, "frame", bar=False)
     for started in (reference, single, vector, cars):
         started.reset()
-    steps = {GYMNASIUM: (functools.partial(step_env, reference), 1)}
+    steps: dict[str, tuple[Callable, int]] = {
+        GYMNASIUM: (functools.partial(step_env, reference), 1)
+    }
     if importlib.util.find_spec("envpool"):
         import envpool
 
@@ -240,7 +245,7 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     slows Python down a little.
     """
     single_thread()
-    parts = {
+    parts: dict[str, list[Callable]] = {
         "reset": [Cars.reset], "physics": [Cars.step], "picture": [Cars.draw],
         "frames": [FrameMemory.push],
         "V": [Inference.encode], "M": [Inference.remember], "C": [control],
@@ -252,7 +257,7 @@ def frame_budget(cars: int, frames: int = 400) -> dict[str, float]:
     count = profile.runcall(drive, batch, range(cars), max_frames=frames).lengths.sum()
     whole = time.perf_counter() - begin
     codes = {name: [inspect.unwrap(one).__code__ for one in own] for name, own in parts.items()}
-    stats = pstats.Stats(profile).stats
+    stats = pstats.Stats(profile).stats  # type: ignore[attr-defined]  # typeshed lacks it
     seconds = {
         name: sum(stats[code.co_filename, code.co_firstlineno, code.co_name][3] for code in own)
         for name, own in codes.items()
@@ -279,7 +284,7 @@ def measure_training(rounds: int) -> dict:
 def v_speed(config: Config, dataset: Dataset, number: int) -> float:
     """Images a second of V in training."""
     vae = VAE.of(config)
-    vae.to(memory_format=torch.channels_last)
+    vae.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     return training_speed(vae_training(config, dataset, vae, Path("unused")), config.vae.batch)
 
 

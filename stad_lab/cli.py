@@ -122,7 +122,7 @@ def explain(error: Exception) -> str | None:
     if isinstance(error, MemoryError | OverflowError) or torch_is_short:
         return f"too large for this machine: {error or type(error).__name__}"
     if isinstance(error, ModuleNotFoundError) and "pip install" not in str(error):
-        return f"{error}: pip install 'stad_lab[{EXTRAS.get(error.name, 'train')}]'"
+        return f"{error}: pip install 'stad_lab[{EXTRAS.get(error.name or '', 'train')}]'"
     known = ValueError, OSError, FloatingPointError, ImportError
     if isinstance(error, known) or type(error).__name__ == "TaskError":
         return str(error)
@@ -449,7 +449,9 @@ def latents(
     from stad_lab.replication.latents import PARTS, measure
 
     folder = output(out)
-    measure(Config.preset(preset), dataset or folder / "dataset", folder, list(parts) or PARTS)
+    measure(
+        Config.preset(preset), dataset or folder / "dataset", folder, list(parts) or list(PARTS)
+    )
     print(f"every measurement: {folder / 'latents.json'}")
 
 
@@ -547,9 +549,11 @@ def compete(
     from stad_lab.compete import run
 
     if kit:
-        return print(run.write_kit(kit))
+        print(run.write_kit(kit))
+        return None
     if commit:
-        return print(run.hide_tracks(commit, tracks))
+        print(run.hide_tracks(commit, tracks))
+        return None
     if check:
         said = run.check_submission(check, limits)
         print(said)
@@ -559,6 +563,7 @@ def compete(
     folder = output(out)
     page = run.run(submissions, secret, folder, limits, processes, reveal, baselines)
     print(f"written to {page}")
+    return None
 
 
 COMMANDS: dict[str, Callable] = {

@@ -210,12 +210,13 @@ def fields_of(config: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
     found = []
     for one in dataclasses.fields(config):
         name, value = prefix + one.name, getattr(config, one.name)
+        kind: Any = one.type
         if not dataclasses.is_dataclass(one.type):
-            found.append((name, one.type, value))
-        elif isinstance(value, one.type):
+            found.append((name, kind, value))
+        elif isinstance(value, kind):
             found += fields_of(value, f"{name}.")
         else:
-            raise ValueError(f"{name}={value!r}: expected a {one.type.__name__} or a dict of it")
+            raise ValueError(f"{name}={value!r}: expected a {kind.__name__} or a dict of it")
     return found
 
 
@@ -273,7 +274,7 @@ def check_same(path: Path, was: dict, now: dict) -> None:
 
 def flatten(values: dict, prefix: str = "") -> dict:
     """A nested dict as a flat one with dotted names: {"a": {"b": 1}} -> {"a.b": 1}."""
-    flat = {}
+    flat: dict[str, Any] = {}
     for name, value in values.items():
         nested = isinstance(value, dict)
         flat |= flatten(value, f"{prefix}{name}.") if nested else {f"{prefix}{name}": value}

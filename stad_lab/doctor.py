@@ -3,7 +3,6 @@
 It must run where things are broken, so a check imports what it needs by itself.
 """
 
-import contextlib
 import importlib.util
 import os
 import platform
@@ -20,8 +19,10 @@ GREEN, AMBER, RED = "green", "amber", "red"
 COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
 INSTALL = "pip install -r environment.txt, in the environment that this Python belongs to"
 LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
-MODULES = ("numpy", "scipy", "pandas", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma")
-MODULES += ("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl")
+MODULES = (
+    *("numpy", "scipy", "pandas", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma"),
+    *("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl"),
+)
 NEEDED = ("", "train")  # extras without which the notebooks do not run
 OPTIONAL_MODULES = ("matplotlib", "PIL", "ipywidgets", "distributed")  # of the extras
 
@@ -90,8 +91,8 @@ class Report:
 def check_environment(folder: str | Path = ".") -> Report:
     """Look at everything, `folder` being where you work; a check that raises gives a red line."""
     checks = (check_python, check_packages, check_imports, check_preset, check_weights, check_drive)
-    checks += (check_processors, check_memory, check_gpu, check_widgets)
-    lines = [line for check in checks for line in attempt(check)]
+    further = (check_processors, check_memory, check_gpu, check_widgets)
+    lines = [line for check in (*checks, *further) for line in attempt(check)]
     return Report((*lines, *attempt(check_folder, Path(folder))))
 
 
@@ -103,7 +104,7 @@ def tell_environment() -> int:
 
 def attempt(check: Callable[..., Iterator[Line]], *arguments) -> list[Line]:
     """The lines of a check; whatever it raises is one more line, a red one."""
-    lines = []
+    lines: list[Line] = []
     try:
         lines.extend(check(*arguments))
     except Exception as error:  # a broken library may raise anything
@@ -128,8 +129,10 @@ def check_packages() -> Iterator[Line]:
     """The versions of all required packages, and what the extras lack."""
     from packaging.requirements import Requirement
 
-    extras = {extra: [] for extra in metadata("stad_lab").get_all("Provides-Extra") or ()}
-    for requirement in map(Requirement, requires("stad_lab")):
+    extras: dict[str, list[str]] = {
+        extra: [] for extra in metadata("stad_lab").get_all("Provides-Extra") or ()
+    }
+    for requirement in map(Requirement, requires("stad_lab") or ()):
         marker, name = requirement.marker, requirement.name
         found = installed_version(name)
         if not marker or any(marker.evaluate({"extra": extra}) for extra in NEEDED):
@@ -151,8 +154,10 @@ def check_packages() -> Iterator[Line]:
 
 def installed_version(name: str) -> str | None:
     """The version of an installed package, or None."""
-    with contextlib.suppress(PackageNotFoundError):
+    try:
         return version(name)
+    except PackageNotFoundError:
+        return None
 
 
 def compare(name: str, found: str | None, wanted: str, remedy: str) -> Line:
@@ -223,7 +228,8 @@ def check_drive() -> Iterator[Line]:
 
 def check_processors() -> Iterator[Line]:
     """Cores that this process may use, and whether others keep them busy."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = count or 1
     limit = LIMITS / "cpu.max"
     quota, _, period = limit.read_text().partition(" ") if limit.exists() else ("max", "", "")
     allowed = max(1, int(quota) // int(period)) if quota.isdigit() else cores

@@ -1,5 +1,6 @@
 """C drives in a dream: from nothing (`make_dream`), or from where an agent is (`dream_on`)."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,7 @@ class Dreamer:
     def reset(self) -> None:
         """Nothing: the memory is the dream's."""
 
-    def act_batch(self, seen: np.ndarray) -> np.ndarray:
+    def act_batch(self, seen: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """C's action for z and the dream's h: float32 (1, 3)."""
         return control(self.parameters, np.concatenate([seen[0], self.env.hidden])[None])
 
@@ -56,13 +57,13 @@ def dream_on(
     Returns:
         The dreamed frames, uint8 (frames, 64, 64, 3), and the actions, float32 (frames, 3).
     """
-    if agent.state is None:
+    state = to_state(agent.state)
+    if state is None:
         raise ValueError("the agent has not acted yet: let it drive some real frames first")
     if len(agent.cars) != 1:
         raise ValueError(
             f"the agent drives {len(agent.cars)} cars, expected one: use agent.keep(np.array([0]))"
         )
-    state = to_state(agent.state)
     with torch.no_grad():
         prediction = agent.mdn_rnn.mixture(state[0])
         latents = prediction.sample(temperature, torch.Generator().manual_seed(seed))[0, 0]

@@ -5,6 +5,7 @@ import importlib.util
 import sys
 from collections.abc import Sequence
 from importlib.machinery import ModuleSpec
+from types import ModuleType
 
 
 def register_environments() -> None:
@@ -46,11 +47,11 @@ class RegisterLater:
         if spec and spec.loader:
             load = spec.loader.exec_module
 
-            def load_and_register(module: object) -> None:
+            def load_and_register(module: ModuleType) -> None:
                 load(module)
                 register_environments()
 
-            spec.loader.exec_module = load_and_register
+            spec.loader.exec_module = load_and_register  # type: ignore[method-assign]  # on purpose
         return spec
 
 

@@ -15,10 +15,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from matplotlib.figure import Figure
 from PIL import Image
 
+from stad_lab.agent import PRETRAINED, shipped_agents
 from stad_lab.cli import parse
+from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.replication.claims import read_claims
 
 ROOT = Path(__file__).parent.parent
@@ -103,6 +106,16 @@ def test_no_page_is_stale():
     for name, draw in blocks.FIGURES.items():
         picture = Image.open(gallery.PICTURES / f"{name}.png")
         assert picture.text["Description"] == draw(claims).get_label(), "run: python docs/renew.py"
+
+
+@pytest.mark.parametrize("agent", shipped_agents())
+def test_a_model_hub_reads_an_agents_recorded_score_from_its_card(agent):
+    _, metadata, _ = (PRETRAINED / agent / "README.md").read_text("utf-8").split("---\n", 2)
+    (entry,) = yaml.safe_load(metadata)["model-index"]
+    (result,) = entry["results"]
+    scores = {one["type"]: one["value"] for one in result["metrics"]}
+    recorded = load_evaluation(PRETRAINED / agent / "evaluation.json")
+    assert float(scores["mean_reward"].partition(" ")[0]) == round(recorded["mean"], 2)
 
 
 def test_a_marker_takes_a_number_by_its_path_and_format():

@@ -8,8 +8,9 @@ answer as a short panel, without a traceback.
 import copy
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,6 +21,10 @@ BY_HAND = "work this value out by hand, and print what your function computes on
 
 class Panel:
     """An exception that IPython shows as a few lines in place of its traceback."""
+
+    def panel(self) -> list[str]:
+        """The lines of the panel, its title first."""
+        raise NotImplementedError
 
     def _render_traceback_(self) -> list[str]:
         title, *lines = self.panel()
@@ -52,7 +57,7 @@ class Unsolved(Panel, NotImplementedError):
         return ["Not done yet", f"  {self}"]
 
 
-def ask(what: str, answer: Callable, *given: object) -> object:
+def ask(what: str, answer: Callable, *given: object) -> Any:
     """Call a student's function, and return its result.
 
     Raises WrongAnswer if the function stops with an error, returns None, or changes an array that
@@ -88,7 +93,7 @@ def check(
     what: str,
     found: object,
     expected: object,
-    mistakes: dict[str, object] | None = None,
+    mistakes: Mapping[str, object] | None = None,
     tolerance: float = 1e-4,
 ) -> None:
     """Print that an answer is right, or raise WrongAnswer with a diagnosis.
@@ -124,7 +129,7 @@ def check_interval(
     check(what, ask(what, answer, *given), np.array(right, float), mistakes, tolerance)
 
 
-def check_kind(what: str, found: object, expected: object) -> None:
+def check_kind(what: str, found: object, expected: Any) -> None:
     """Raise WrongAnswer if an answer is no number, array or tensor where one is expected."""
     kind, wanted = type(found).__name__, type(expected).__name__
     is_tensor, wants_tensor = (isinstance(one, torch.Tensor) for one in (found, expected))

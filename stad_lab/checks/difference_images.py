@@ -49,8 +49,8 @@ def check_differences(differences: Callable, film: np.ndarray, stride: int) -> n
     found = ask(what, differences, film, stride)
     later = slice(stride, None)  # a mistake there is named, whatever the first frames are
     if np.shape(found) == right.shape and not agree(np.asarray(found)[later], right[later], 1e-4):
-        wrong = {hint: one[later] for hint, one in mistakes.items() if one.shape == right.shape}
-        check(f"{what}[{stride}:]", np.asarray(found)[later], right[later], wrong)
+        late = {hint: one[later] for hint, one in mistakes.items() if one.shape == right.shape}
+        check(f"{what}[{stride}:]", np.asarray(found)[later], right[later], late)
     check(what, found, right, mistakes)
     return found
 

@@ -11,6 +11,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -24,7 +25,7 @@ PROCESSES, FILE_SIZE = 64, 100_000_000  # of a submission; bytes
 class Separate:
     """A batch of agents that act for one car each, as `make_agent` gives them."""
 
-    def __init__(self, make: Callable[[], object], first: object):
+    def __init__(self, make: Callable[[], Any], first: Any):
         self.make, self.agents, self.cars = make, [first], [0]
 
     def reset(self, count: int) -> None:
@@ -48,7 +49,7 @@ class Separate:
 class Together:
     """One agent that acts for many cars at once, by `act_batch` and `keep`."""
 
-    def __init__(self, agent: object):
+    def __init__(self, agent: Any):
         self.agent = agent
 
     def reset(self, count: int) -> None:
@@ -83,6 +84,8 @@ def load_submission(path: Path) -> Separate | Together:
         return Together(load_agent(path))
     sys.path.append(str(file.parent))
     spec = importlib.util.spec_from_file_location("submission", file)
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{file.name} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules["submission"] = module
     spec.loader.exec_module(module)

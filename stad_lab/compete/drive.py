@@ -6,6 +6,7 @@ at a time, so that the others are not lost; after MOST_FAILURES the remaining tr
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -76,9 +77,16 @@ def drive_submission(
     name: str, path: Path, tracks: list[int], file: Path, limits: Limits, hidden: tuple[Path, ...]
 ) -> dict:
     """Drive all tracks with one submission, from where the file of its results ends."""
-    asked = {"submission": fingerprint(path), "tracks": checksum_of_json(tracks)}
+    asked: dict[str, Any] = {"submission": fingerprint(path), "tracks": checksum_of_json(tracks)}
     asked |= {"limits": asdict(limits)}
-    result = {"kind": KIND, **asked, "returns": [], "failures": [], "seconds": 0.0, "laps": {}}
+    result: dict[str, Any] = {
+        "kind": KIND,
+        **asked,
+        "returns": [],
+        "failures": [],
+        "seconds": 0.0,
+        "laps": {},
+    }
     if file.exists():
         known = load_json(file, "delete it, to drive again", kind=KIND)
         if all(known.get(key) == value for key, value in asked.items()):
@@ -117,7 +125,8 @@ def drive_batch(
 
 def drive_recorded(driver: Submission, tracks: list[int]) -> tuple[np.ndarray, list[list]]:
     """Returns float64 (tracks,), and the actions of every episode."""
-    cars, actions = Cars(len(tracks)), [[] for _ in tracks]
+    cars = Cars(len(tracks))
+    actions: list[list] = [[] for _ in tracks]
     cars.reset(tracks)
 
     def note(driving: np.ndarray, _, chosen: np.ndarray) -> None:
@@ -159,7 +168,7 @@ def fingerprint(path: Path) -> str:
 
 def check_submission(path: Path, limits: Limits, tracks: tuple[int, ...] = (0, 1, 2)) -> str:
     """Drive a few public tracks with a submission; one line on how it went."""
-    result = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
+    result: dict[str, Any] = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
     drive_batch(path, list(tracks), result, limits, ())
     if result["failures"]:
         return f"FAILED: {result['failures'][0]}"

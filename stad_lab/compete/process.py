@@ -130,7 +130,7 @@ class Submission:
             process.wait()
         shutil.rmtree(self.folder, ignore_errors=True)
 
-    def _start(self, path: Path) -> subprocess.Popen:
+    def _start(self, path: Path) -> subprocess.Popen[bytes]:
         package = Path(stad_lab.__file__).resolve().parent
         command = [sys.executable, "-P", "-m", "stad_lab.compete.child", str(path)]
         command.append(str(round(self.limits.memory * 1e9)))
@@ -152,20 +152,28 @@ class Submission:
             "MPLCONFIGDIR": str(self.folder),
             "STAD_LAB_ISOLATED": "1" if isolated else "",
         }
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
-        where = {"cwd": self.folder, "env": environment, "start_new_session": os.name != "nt"}
-        return subprocess.Popen(command, **pipes, **where)
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd=self.folder,
+            env=environment,
+            start_new_session=os.name != "nt",
+        )
 
     def _ask(self, seconds: float, kind: str = "", array=None, **fields) -> np.ndarray:
         """Send a message, if there is one, and return the array of the answer."""
+        stdin, stdout = self.process.stdin, self.process.stdout
+        assert stdin is not None and stdout is not None  # pipes
         begin = time.monotonic()
         left = self.limits.total - self.used if kind == "act" else seconds
         self.deadline = begin + min(seconds, left)
         try:
             if kind:
-                send(self.process.stdin, kind, array, **fields)
+                send(stdin, kind, array, **fields)
             most = 0 if array is None else len(array) * 3 * 8
-            answer, actions = receive(self.process.stdout, np.float64, most)
+            answer, actions = receive(stdout, np.float64, most)
         except (EOFError, OSError):
             raise self._failed(self._ending()) from None
         except (ValueError, TypeError, RecursionError):

@@ -5,7 +5,7 @@ The child answers "ready", "actions" (with float64 (cars, 3)) or "error" (with o
 """
 
 import json
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 
@@ -13,7 +13,7 @@ LONGEST_LINE = 10_000  # bytes
 LARGEST_ARRAY = 100_000_000  # bytes
 
 
-def send(stream: BinaryIO, kind: str, array: np.ndarray | None = None, **fields) -> None:
+def send(stream: IO[bytes], kind: str, array: np.ndarray | None = None, **fields) -> None:
     """Write one message."""
     size = 0 if array is None else array.nbytes
     shape = None if array is None else array.shape
@@ -24,7 +24,7 @@ def send(stream: BinaryIO, kind: str, array: np.ndarray | None = None, **fields)
     stream.flush()
 
 
-def receive(stream: BinaryIO, dtype: type, most: int = LARGEST_ARRAY) -> tuple[dict, np.ndarray]:
+def receive(stream: IO[bytes], dtype: type, most: int = LARGEST_ARRAY) -> tuple[dict, np.ndarray]:
     """Read one message: its fields, and its array of this dtype (of size 0 if it has none).
 
     EOFError if the other process has ended. ValueError for what is no message, or for an array of
@@ -41,5 +41,5 @@ def receive(stream: BinaryIO, dtype: type, most: int = LARGEST_ARRAY) -> tuple[d
     content = stream.read(fields["size"])
     if len(content) < fields["size"]:
         raise EOFError
-    array = np.frombuffer(content, dtype)
+    array: np.ndarray = np.frombuffer(content, dtype)
     return fields, array.reshape(fields["shape"]) if fields["size"] else array

@@ -6,6 +6,7 @@ differs by less than 0.3 of 255 on average, in the usual colours. To drive many 
 """
 
 import inspect
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,6 +14,7 @@ from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
 
 from stad_lab.envs import physics
+from stad_lab.envs.arguments import check_options, choice, numbers, shown, whole_number
 from stad_lab.envs.cars import Cars, check_rules, pose_on
 from stad_lab.envs.frames import OBSERVATION_SIZE
 from stad_lab.envs.own_track import Checkpoints
@@ -39,15 +41,21 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
     Raises:
         ValueError: an option that the environment does not have, or another value of it.
     """
-    options = inspect.signature(CarRacing if fast else reference.CarRacing).parameters
-    options = [*options, "max_episode_steps", "disable_env_checker"]
-    if unknown := [name for name in kwargs if name not in options]:
+    if not isinstance(fast, bool | np.bool_):
+        raise ValueError(f"fast={shown(fast)}: expected True or False")
+    signature = inspect.signature(CarRacing if fast else reference.CarRacing)
+    known = [*signature.parameters, "max_episode_steps", "disable_env_checker"]
+    if unknown := [name for name in kwargs if name not in known]:
         raise ValueError(
-            f"make_env: unknown {', '.join(unknown)}; choose from {', '.join(options)}. The seed of"
+            f"make_env: unknown {', '.join(unknown)}; choose from {', '.join(known)}. The seed of"
             " a track belongs to reset: env.reset(seed=1)"
         )
     rules = ("continuous", "lap_complete_percent", "domain_randomize", "bar")
     check_rules(**{name: kwargs[name] for name in rules if name in kwargs})
+    choice("render_mode", kwargs.get("render_mode"), (None, *RENDER_MODES))
+    if kwargs.get("max_episode_steps") not in (None, -1):  # Gymnasium's: the usual, and no limit
+        steps = whole_number("max_episode_steps", kwargs["max_episode_steps"], 1)
+        kwargs["max_episode_steps"] = steps
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
 
 
@@ -60,7 +68,7 @@ def place_car(
         env: from `make_env`, fast or not.
         tile, speed, turn, offset: as for `Cars.place`.
     """
-    racing = env.unwrapped
+    racing: Any = env.unwrapped
     if isinstance(racing, CarRacing):
         return racing.place(tile, speed=speed, turn=turn, offset=offset)
     heading, x, y = pose_on(racing.track, tile, turn, offset)
@@ -86,10 +94,8 @@ def action_space(continuous: bool = True) -> gym.Space:
 
 
 def check_skip(frame_skip: int) -> int:
-    """The number of frames of a step. ValueError if it is not a whole number from 1 on."""
-    if not isinstance(frame_skip, int | np.integer) or frame_skip < 1:
-        raise ValueError(f"frame_skip={frame_skip!r}: expected a whole number from 1 on")
-    return int(frame_skip)
+    """The number of frames of a step. ValueError if it is not a whole number from 1 to 1,000."""
+    return whole_number("frame_skip", frame_skip, 1, MAX_FRAMES)
 
 
 class CarRacing(gym.Env, gym.utils.EzPickle):
@@ -128,14 +134,11 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         rules = (continuous, lap_complete_percent, domain_randomize)
         added = (observes, size, frame_skip, track)
         gym.utils.EzPickle.__init__(self, render_mode, bar, *rules, *added)
-        if render_mode not in (None, *RENDER_MODES):
-            raise ValueError(
-                f"render_mode={render_mode!r}: expected one of {RENDER_MODES}, or None"
-            )
-        self.render_mode, self.continuous = render_mode, continuous
+        self.render_mode = choice("render_mode", render_mode, (None, *RENDER_MODES))
+        self.continuous = continuous
         self.view, self.frame_skip = View(observes, size, bar), check_skip(frame_skip)
         self.observation_space, self.action_space = self.view.space, action_space(continuous)
-        self.cars: Cars | None = Cars(1, "observation", bar, *rules, track)
+        self.cars = Cars(1, "observation", bar, *rules, track)
         self._window: Window | None = None
         self._started = False
 
@@ -149,7 +152,7 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         self._check_open()
         super().reset(seed=seed)
         self.cars.randoms[0], self.cars.seeds[0] = self.np_random, self.np_random_seed
-        self.cars.reset(randomize=(options or {}).get("randomize", True))
+        self.cars.reset(randomize=check_options(options).get("randomize", True))
         self._started = True
         self._show()
         return self.view.look(self.cars)[0], {}
@@ -162,10 +165,11 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
             RuntimeError: called before `reset`, or after `close`.
         """
         self._check_begun("step")
-        rewards, ended = self.cars.step(np.asarray(action)[None])
+        actions = numbers("action", action, "numbers")[None]
+        rewards, ended = self.cars.step(actions)
         for _ in range(self.frame_skip - 1):
             if not ended[0]:
-                further, ended = self.cars.step(np.asarray(action)[None])
+                further, ended = self.cars.step(actions)
                 rewards += further
         ending = self.cars.cars["ending"][0]
         info = {"lap_finished": bool(ending == physics.LAP_FINISHED)} if ended[0] else {}
@@ -206,7 +210,8 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         if self._window is not None:
             self._window.close()
         self.view.close()
-        self.cars = self._window = None
+        self._window = None
+        self.cars = None  # type: ignore[assignment]  # closed
 
     def _show(self) -> None:
         if self.render_mode == "human":

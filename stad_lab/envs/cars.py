@@ -2,11 +2,21 @@
 
 import threading
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from gymnasium.utils import seeding
 
 from stad_lab.envs import physics, picture
+from stad_lab.envs.arguments import (
+    car_numbers,
+    choice,
+    finite_number,
+    is_whole,
+    numbers,
+    shown,
+    whole_number,
+)
 from stad_lab.envs.compiling import announced
 from stad_lab.envs.frames import FRAME_SIZE, OBSERVATION_SIZE
 from stad_lab.envs.own_track import Checkpoints, make_own_track
@@ -17,6 +27,7 @@ from stad_lab.envs.track import MAX_TILES, TRACK_WIDTH, Track, make_track
 DISCRETE_ACTIONS = np.array(
     [[-0.0, 0, 0], [0.6, 0, 0], [-0.6, 0, 0], [-0.0, 0.2, 0], [-0.0, 0, 0.8]], np.float64
 )
+MOST_CARS = 100_000  # 5 MB each
 SIZES = {"observation": OBSERVATION_SIZE, "frame": FRAME_SIZE}  # of the pictures, pixels
 COLORS = {"road": (102, 102, 102), "background": (102, 204, 102), "grass": (102, 230, 102)}
 
@@ -63,20 +74,22 @@ class Cars:
         track: Checkpoints | None = None,
     ):
         check_rules(continuous, lap_complete_percent, domain_randomize, bar)
+        count = whole_number("count", count, 1, MOST_CARS)
+        choice("shows", shows, SIZES)
         warm_up()
         self.shows, self.bar, self.continuous = shows, bar, continuous
         self.lap_complete_percent = float(lap_complete_percent)
         self.domain_randomize = domain_randomize
         self.own_track = None if track is None else make_own_track(track)
         self.cars, self.roads = np.zeros(count, physics.CAR), np.zeros(count, physics.ROAD)
-        self.tracks: list[Track | None] = [None] * count
+        self.tracks: list[Track] = [None] * count  # type: ignore[list-item]  # until reset
         randoms = [seeding.np_random() for _ in range(count)]
         self.randoms, self.seeds = map(list, zip(*randoms, strict=True))
         self.colors = {
             name: np.tile(np.array(one, float), (count, 1)) for name, one in COLORS.items()
         }
         self._tiles = np.zeros((count, MAX_TILES, 4, 2))
-        self._painted = np.zeros(count, bool)
+        self._painted, self._begun = np.zeros((2, count), bool)
         self.ground: picture.Ground | None = None
         for car in range(count if domain_randomize else 0):
             self._draw_colors(car)
@@ -87,7 +100,7 @@ class Cars:
     def reset(
         self,
         seeds: Sequence[int | None] | None = None,
-        which: Sequence[int] | None = None,
+        which: Sequence[int] | np.ndarray | None = None,
         randomize: bool = True,
     ) -> None:
         """Begin new episodes.
@@ -97,18 +110,17 @@ class Cars:
             which: numbers of the cars; all by default.
             randomize: whether to draw new colours, with `domain_randomize`.
         """
-        which = range(len(self)) if which is None else which
-        seeds = [None] * len(which) if seeds is None else seeds
-        for car, seed in zip(which, seeds, strict=True):
+        chosen = self._numbers(which).tolist()
+        for car, seed in zip(chosen, check_seeds(seeds, len(chosen)), strict=True):
             if seed is not None:
-                self.randoms[car], self.seeds[car] = seeding.np_random(int(seed))
+                self.randoms[car], self.seeds[car] = seeding.np_random(seed)
             if self.domain_randomize and randomize:
                 self._draw_colors(car)
             track = self.tracks[car] = self.own_track or make_track(self.randoms[car])
             share = self.lap_complete_percent
             physics.start_car(self.cars, self.roads, car, track.path, track.tiles, share)
             self._tiles[car, : len(track.tiles)] = track.tiles
-            self._painted[car] = False
+            self._painted[car], self._begun[car] = False, True
 
     def step(
         self, actions: np.ndarray, which: np.ndarray | None = None
@@ -124,16 +136,18 @@ class Cars:
             `cars["ending"]` says how.
 
         Raises:
-            ValueError: an action that is not finite or not one of the five, or a wrong shape.
+            ValueError: an action that is not finite or not one of the five, a wrong shape, or a car
+                that is not there.
+            RuntimeError: a car that no `reset` has given a track.
         """
-        which = self._numbers(which)
+        which = self._started(which)
         rewards, actions = np.empty(len(which)), self._checked(actions, len(which))
         physics.step_cars(self.cars, self.roads, which, actions, rewards)
         return rewards, self.cars["ending"][which] != physics.DRIVING
 
     def draw(self, which: np.ndarray | None = None) -> np.ndarray:
         """What cars see, uint8 (n, 96, 96, 3) or (n, 64, 64, 3); `which` as for `step`."""
-        which = self._numbers(which)
+        which = self._started(which)
         if self.ground is None:
             self.ground = picture.make_ground(len(self))
         for car in which[~self._painted[which]]:
@@ -160,31 +174,34 @@ class Cars:
         Raises:
             ValueError: a tile that is not a whole number, or another number that is not finite.
         """
-        whole = isinstance(tile, int | np.integer)
-        if not whole or not np.isfinite([speed, turn, offset]).all():
-            raise ValueError(
-                f"tile={tile!r}, speed={speed}, turn={turn}, offset={offset}: expected a whole"
-                " number and three finite ones"
-            )
+        car = whole_number("car", car, 0, len(self) - 1)
+        self._started([car])
         pose = pose_on(self.tracks[car].path, tile, turn, offset)
-        physics.place_car(self.cars, car, *pose, float(speed))
+        physics.place_car(self.cars, car, *pose, finite_number("speed", speed))
 
-    def _numbers(self, which: np.ndarray | None) -> np.ndarray:
-        return np.arange(len(self)) if which is None else np.asarray(which, np.int64)
+    def _numbers(self, which: Sequence[int] | np.ndarray | None) -> np.ndarray:
+        return car_numbers(which, len(self))
+
+    def _started(self, which: Sequence[int] | np.ndarray | None) -> np.ndarray:
+        which = self._numbers(which)
+        if not self._begun[which].all():
+            raise RuntimeError("a car has no track yet: call reset first")
+        return which
 
     def _checked(self, actions: np.ndarray, count: int) -> np.ndarray:
         if self.continuous:
-            actions = np.ascontiguousarray(actions, np.float64)
+            found = numbers("actions", actions, f"numbers of shape ({count}, 3)")
+            actions = np.ascontiguousarray(found, np.float64)
             if actions.shape != (count, 3) or not np.isfinite(actions).all():
                 raise ValueError(
                     f"actions {actions}: expected finite numbers of shape ({count}, 3), steering,"
                     " gas and brake"
                 )
             return actions
-        numbers = np.asarray(actions)
-        if numbers.shape != (count,) or not np.isin(numbers, range(len(DISCRETE_ACTIONS))).all():
-            raise ValueError(f"actions {numbers}: expected {count} numbers, each 0 to 4")
-        return DISCRETE_ACTIONS[numbers.astype(np.int64)]
+        kinds = numbers("actions", actions, f"{count} numbers, each 0 to 4")
+        if kinds.shape != (count,) or not np.isin(kinds, range(len(DISCRETE_ACTIONS))).all():
+            raise ValueError(f"actions {kinds}: expected {count} numbers, each 0 to 4")
+        return DISCRETE_ACTIONS[kinds.astype(np.int64)]
 
     def _paint(self, car: int) -> None:
         polygons, kinds = road_polygons(self.tracks[car])
@@ -218,12 +235,34 @@ def check_rules(
         raise ValueError(f"lap_complete_percent={lap_complete_percent!r}: expected 0 to 1")
 
 
+def seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
+    """The seeds of `count` cars: n means n, n + 1, ...; others as `check_seeds`."""
+    if is_whole(seed):
+        first = whole_number("seed", seed)
+        return list(range(first, first + count))
+    return check_seeds(seed, count)
+
+
+def check_seeds(seeds: Any, count: int) -> list[int | None]:
+    """A seed for each of `count` cars, or None. ValueError for another number or kind of them."""
+    if seeds is None:
+        return [None] * count
+    if not isinstance(seeds, Sequence | np.ndarray) or isinstance(seeds, str | bytes):
+        raise ValueError(f"seeds={shown(seeds)}: expected {count} seeds, one for each car")
+    if len(seeds) != count:
+        raise ValueError(f"{len(seeds)} seeds for {count} cars: expected one for each")
+    return [None if seed is None else whole_number("seed", seed) for seed in seeds]
+
+
 def pose_on(
-    path: Sequence, tile: int, turn: float = 0.0, offset: float = 0.0
+    path: Sequence | np.ndarray, tile: int, turn: float = 0.0, offset: float = 0.0
 ) -> tuple[float, float, float]:
     """Heading, x and y of a car that `Cars.place` puts on a tile of a track's centre line."""
+    if not is_whole(tile):
+        raise ValueError(f"tile={shown(tile)}: expected a whole number")
+    turn = finite_number("turn", turn)
     _, beta, x, y = path[tile % len(path)]
-    across = offset * TRACK_WIDTH
+    across = finite_number("offset", offset) * TRACK_WIDTH
     x, y = x + across * np.cos(beta), y + across * np.sin(beta)
     return float(beta + turn), float(x), float(y)
 

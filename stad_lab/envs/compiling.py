@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numba
-from filelock import FileLock, Timeout
+from filelock import BaseFileLock, FileLock, Timeout
 from numba.core import event
 
 NOTICE = "compiling the engine, once: about 20 seconds"
@@ -46,10 +46,10 @@ def use_temporary_folder() -> None:
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
         if folder.is_symlink() or (user != "user" and folder.stat().st_uid != user):
-            folder = tempfile.mkdtemp()  # who owns the folder could plant code
+            folder = Path(tempfile.mkdtemp())  # who owns the folder could plant code
     except OSError:
         return
-    numba.config.CACHE_DIR = str(folder)
+    numba.config.CACHE_DIR = str(folder)  # type: ignore[attr-defined]
 
 
 class Announcement(event.Listener):
@@ -60,7 +60,9 @@ class Announcement(event.Listener):
     """
 
     def __init__(self, beside: str | None = None):
-        self.printed, self.beside, self.process, self.lock = False, beside, None, None
+        self.printed, self.beside = False, beside
+        self.process: subprocess.Popen | None = None
+        self.lock: BaseFileLock | None = None
 
     def on_start(self, begun: event.Event) -> None:
         """Numba begins to compile a function."""
@@ -105,10 +107,11 @@ class Announcement(event.Listener):
 def start_python(code: str) -> subprocess.Popen:
     """Run code in another Python with the same modules and the same folder of compiled code."""
     same = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    if numba.config.CACHE_DIR:
-        same["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR
-    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-    return subprocess.Popen([sys.executable, "-c", code], env=os.environ | same, **quiet)
+    if folder := getattr(numba.config, "CACHE_DIR", ""):
+        same["NUMBA_CACHE_DIR"] = folder
+    none = subprocess.DEVNULL
+    command = [sys.executable, "-c", code]
+    return subprocess.Popen(command, env=os.environ | same, stdin=none, stdout=none, stderr=none)
 
 
 @contextmanager

@@ -6,15 +6,14 @@ CarRacing, M predicts neither reward nor the end of an episode: the reward is al
 ends after `max_frames`.
 """
 
-from typing import ClassVar
-
 import gymnasium as gym
 import numpy as np
 import torch
 
+from stad_lab.envs.arguments import check_options, choice, finite_array, shown, whole_number
 from stad_lab.models.controller import ACTION_SIZE
-from stad_lab.models.mdn_rnn import check_temperature
-from stad_lab.models.vae import to_uint8
+from stad_lab.models.mdn_rnn import MDNRNN, check_temperature
+from stad_lab.models.vae import VAE, to_uint8
 
 
 class DreamEnv(gym.Env):
@@ -34,25 +33,25 @@ class DreamEnv(gym.Env):
         render_mode: "rgb_array" for pictures from `render()`, or None.
     """
 
-    metadata: ClassVar[dict] = {"render_modes": ["rgb_array"], "render_fps": 50}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 50}  # noqa: RUF012
 
     def __init__(
         self,
-        vae: torch.nn.Module,
-        mdn_rnn: torch.nn.Module,
+        vae: VAE,
+        mdn_rnn: MDNRNN,
         temperature: float = 1.0,
         max_frames: int = 1000,
         render_mode: str | None = None,
     ):
         check_temperature(temperature)
-        if render_mode not in (None, "rgb_array"):
-            raise ValueError(f"render_mode={render_mode!r}: expected 'rgb_array' or None")
+        choice("render_mode", render_mode, (None, "rgb_array"))
+        max_frames = whole_number("max_frames", max_frames, 1)
         self.vae, self.mdn_rnn = vae, mdn_rnn
         self.temperature, self.max_frames, self.render_mode = temperature, max_frames, render_mode
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (vae.latent_size,), np.float32)
         lowest = np.array([-1, 0, 0], np.float32)
         self.action_space = gym.spaces.Box(lowest, np.ones(ACTION_SIZE, np.float32))
-        self.latents: torch.Tensor | None = None
+        self.latents: torch.Tensor = None  # type: ignore[assignment]  # until reset
 
     def reset(
         self, *, seed: int | None = None, options: dict | None = None
@@ -66,18 +65,20 @@ class DreamEnv(gym.Env):
                 ValueError for another shape or numbers that are not finite.
         """
         super().reset(seed=seed)
-        options = options or {}
+        options = check_options(options)
         self.generator = torch.Generator().manual_seed(int(self.np_random.integers(2**31)))
         size, zeros = self.vae.latent_size, torch.zeros(1, 1, self.mdn_rnn.hidden_size)
         latents = options.get("latents")
         if latents is None:
             latents = self.np_random.standard_normal(size)
-        self.latents = torch.tensor(np.asarray(latents, np.float32))
-        check_numbers("latents", self.latents, (size,), "z of V")
-        self.state = options.get("state") or (zeros, zeros.clone())
+        self.latents = torch.tensor(finite_array("latents", latents, (size,), "z of V"))
+        state = options.get("state")
+        self.state = (zeros, zeros.clone()) if state is None else state
+        if not isinstance(self.state, tuple | list) or len(self.state) != 2:
+            raise ValueError(f"state={shown(self.state)}: expected M's memory (h, c)")
         for part in self.state:
-            check_numbers("memory", part, tuple(zeros.shape), "h and c of one car")
-        self.prediction, self.frames = None, 0
+            finite_array("memory", part, tuple(zeros.shape), "h and c of one car")
+        self.frames = 0
         return self.latents.numpy().copy(), {"hidden": self.hidden}
 
     @property
@@ -89,13 +90,11 @@ class DreamEnv(gym.Env):
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Dream one frame: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h})."""
         self._check_begun("step")
-        action = np.asarray(action, np.float32)
-        if action.shape != (ACTION_SIZE,) or not np.isfinite(action).all():
-            raise ValueError(f"action {action}: expected finite steering, gas and brake")
-        self.prediction, self.state = self.mdn_rnn(
+        action = finite_array("action", action, (ACTION_SIZE,), "steering, gas and brake")
+        prediction, self.state = self.mdn_rnn(
             self.latents[None, None], torch.from_numpy(action)[None, None], self.state
         )
-        self.latents = self.prediction.sample(self.temperature, self.generator)[0, 0]
+        self.latents = prediction.sample(self.temperature, self.generator)[0, 0]
         self.frames += 1
         ended = self.frames >= self.max_frames
         return self.latents.numpy().copy(), 0.0, False, ended, {"hidden": self.hidden}
@@ -111,13 +110,3 @@ class DreamEnv(gym.Env):
     def _check_begun(self, call: str) -> None:
         if self.latents is None:
             raise RuntimeError(f"{call} before reset: call reset() to begin a dream")
-
-
-def check_numbers(name: str, found: torch.Tensor, shape: tuple[int, ...], meaning: str) -> None:
-    """Raise ValueError unless a tensor has this shape and its numbers are finite."""
-    finite = torch.isfinite(found)
-    if tuple(found.shape) != shape or not finite.all():
-        raise ValueError(
-            f"{name} of shape {tuple(found.shape)}, {finite.sum()} of them finite: expected {shape}"
-            f" finite numbers, {meaning}"
-        )

@@ -18,9 +18,12 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
+from stad_lab.envs.arguments import check_options, numbers, whole_number
+from stad_lab.envs.cars import MOST_CARS, seeds_of
 from stad_lab.envs.dream import DreamEnv
-from stad_lab.models.mdn_rnn import Mixture
-from stad_lab.models.vae import to_uint8
+from stad_lab.envs.vector import check_autoreset
+from stad_lab.models.mdn_rnn import MDNRNN, Mixture
+from stad_lab.models.vae import VAE, to_uint8
 
 
 class DreamVector(gym.vector.VectorEnv):
@@ -37,18 +40,18 @@ class DreamVector(gym.vector.VectorEnv):
 
     def __init__(
         self,
-        vae: torch.nn.Module,
-        mdn_rnn: torch.nn.Module,
+        vae: VAE,
+        mdn_rnn: MDNRNN,
         num_envs: int = 1,
         temperature: float = 1.0,
         max_frames: int = 1000,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
     ):
-        mode = AutoresetMode(autoreset_mode)
-        if num_envs < 1 or mode == AutoresetMode.SAME_STEP:
-            found = f"num_envs={num_envs}, autoreset_mode={mode.value}"
-            raise ValueError(f"{found}: expected at least 1, and NextStep or Disabled")
+        mode = check_autoreset(autoreset_mode)
+        num_envs = whole_number("num_envs", num_envs, 1, MOST_CARS)
+        if mode == AutoresetMode.SAME_STEP:
+            raise ValueError(f"autoreset_mode={mode.value}: choose NextStep or Disabled")
         options = temperature, max_frames, render_mode
         self.dreams = [DreamEnv(vae, mdn_rnn, *options) for _ in range(num_envs)]
         self.vae, self.mdn_rnn, self.temperature = vae, mdn_rnn, temperature
@@ -70,13 +73,12 @@ class DreamVector(gym.vector.VectorEnv):
             options: "reset_mask", bool (num_envs,), to begin only some anew.
         """
         self._check_open()
-        mask = np.asarray((options or {}).get("reset_mask", np.ones(self.num_envs, bool)))
+        mask = np.asarray(check_options(options).get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not (self._begun or mask.all()):
             raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), at first all")
-        if seed is None or isinstance(seed, int | np.integer):
-            seed = [None if seed is None else int(seed) + n for n in range(self.num_envs)]
-        for number in np.flatnonzero(mask):
-            self.dreams[number].reset(seed=seed[number])
+        seeds = seeds_of(seed, self.num_envs)
+        for number in np.flatnonzero(mask).tolist():
+            self.dreams[number].reset(seed=seeds[number])
         self._ended[mask], self._begun = False, True
         return self._observations(), self._info()
 
@@ -88,7 +90,7 @@ class DreamVector(gym.vector.VectorEnv):
         self._check_open()
         if not self._begun:
             raise ResetNeeded("no dream has begun: call reset before step")
-        actions = np.asarray(actions, np.float32)
+        actions = numbers("actions", actions, "one action for each dream").astype(np.float32)
         if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
             raise ValueError(
                 f"actions of shape {actions.shape}: expected finite numbers of shape"
@@ -128,9 +130,9 @@ class DreamVector(gym.vector.VectorEnv):
         )
         for place, dream in enumerate(dreams):
             own = slice(place, place + 1)
-            dream.prediction = Mixture(*(part[own] for part in prediction))
+            predicted = Mixture(*(part[own] for part in prediction))
             dream.state = tuple(part[:, own] for part in after)
-            dream.latents = dream.prediction.sample(self.temperature, dream.generator)[0, 0]
+            dream.latents = predicted.sample(self.temperature, dream.generator)[0, 0]
             dream.frames += 1
 
     def _observations(self) -> np.ndarray:

@@ -17,11 +17,20 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from stad_lab.envs import physics
+from stad_lab.envs.arguments import check_options, choice, numbers, whole_number
 from stad_lab.envs.car_racing import MAX_FRAMES, action_space, check_skip
-from stad_lab.envs.cars import Cars
+from stad_lab.envs.cars import MOST_CARS, Cars, seeds_of
 from stad_lab.envs.frames import OBSERVATION_SIZE
 from stad_lab.envs.own_track import Checkpoints
 from stad_lab.envs.views import View
+
+
+def check_autoreset(mode: AutoresetMode | str) -> AutoresetMode:
+    """Gymnasium's mode of a name. ValueError for another one."""
+    names = {one.value: one for one in AutoresetMode}
+    if isinstance(mode, AutoresetMode):
+        return mode
+    return names[choice("autoreset_mode", mode, names)]
 
 
 class CarRacingVector(gym.vector.VectorEnv):
@@ -58,13 +67,10 @@ class CarRacingVector(gym.vector.VectorEnv):
         frame_skip: int = 1,
         track: Checkpoints | None = None,
     ):
-        if num_envs < 1 or max_episode_steps < 1 or render_mode is not None:
-            raise ValueError(
-                f"num_envs={num_envs}, max_episode_steps={max_episode_steps},"
-                f" render_mode={render_mode!r}: expected at least 1, at least 1, and None"
-            )
-        self.num_envs, self.max_episode_steps = num_envs, max_episode_steps
-        self.autoreset_mode, self.render_mode = AutoresetMode(autoreset_mode), render_mode
+        num_envs = self.num_envs = whole_number("num_envs", num_envs, 1, MOST_CARS)
+        self.max_episode_steps = whole_number("max_episode_steps", max_episode_steps, 1)
+        self.render_mode = choice("render_mode", render_mode, (None,))
+        self.autoreset_mode = check_autoreset(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         rules = (continuous, lap_complete_percent, domain_randomize)
         self.view, self.frame_skip = View(observes, size, bar), check_skip(frame_skip)
@@ -90,19 +96,16 @@ class CarRacingVector(gym.vector.VectorEnv):
             Observations, uint8 (num_envs, 96, 96, 3), and {}.
         """
         self._check_open()
-        options = options or {}
+        options = check_options(options)
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
             raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), one at least")
         if not self._begun and not mask.all():
             raise ValueError(f"reset_mask={mask}: the first reset is of all cars, leave it out")
-        if seed is None or isinstance(seed, int | np.integer):
-            seed = [None if seed is None else seed + car for car in range(self.num_envs)]
-        whole = [one is None or (isinstance(one, int | np.integer) and one >= 0) for one in seed]
-        if len(whole) != self.num_envs or not all(whole):
-            raise ValueError(f"seed={seed!r}: expected {self.num_envs} numbers 0, 1, ..., or one")
+        whole = seeds_of(seed, self.num_envs)
         which = np.flatnonzero(mask)
-        self.cars.reset([seed[car] for car in which], which, options.get("randomize", True))
+        seeds = [one for one, asked in zip(whole, mask, strict=True) if asked]
+        self.cars.reset(seeds, which, options.get("randomize", True))
         self._ended[which], self._begun = False, True
         return self.view.look(self.cars), {}
 
@@ -119,7 +122,8 @@ class CarRacingVector(gym.vector.VectorEnv):
         self._check_open()
         if not self._begun:
             raise ResetNeeded("no episode has begun: call reset before step")
-        actions, shape = np.asarray(actions), self.action_space.shape
+        shape = self.action_space.shape
+        actions = numbers("actions", actions, f"numbers of shape {shape}")
         if actions.shape != shape:
             raise ValueError(f"actions of shape {actions.shape}: expected {shape}, a car in a row")
         begin = np.flatnonzero(self._ended)
@@ -142,14 +146,14 @@ class CarRacingVector(gym.vector.VectorEnv):
             info = self._begin_again(observations, info)
         return observations, rewards, terminated, truncated, info
 
-    @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:
+    @property  # type: ignore[misc]  # as SyncVectorEnv
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
         """The random numbers of each car, as `SyncVectorEnv` gives them."""
         self._check_open()
         return tuple(self.cars.randoms)
 
     @property
-    def np_random_seed(self) -> tuple[int, ...]:
+    def np_random_seed(self) -> tuple[int, ...]:  # type: ignore[override]
         """The last seed of each car."""
         self._check_open()
         return tuple(self.cars.seeds)
@@ -157,7 +161,7 @@ class CarRacingVector(gym.vector.VectorEnv):
     def close_extras(self, **kwargs) -> None:
         """Release the memory of the tracks."""
         self.view.close()
-        self.cars = None
+        self.cars = None  # type: ignore[assignment]  # closed
 
     def _check_open(self) -> None:
         if self.closed:

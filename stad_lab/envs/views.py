@@ -46,8 +46,8 @@ class View:
         if self.observes == "state":
             return observe_state(cars, which)
         if self.observes == "above":
-            return np.stack([draw_above(cars, car, self.size) for car in which])
-        return np.stack([self._draw(cars, car) for car in which])
+            return np.stack([draw_above(cars, car, self.size) for car in which.tolist()])
+        return np.stack([self._draw(cars, car) for car in which.tolist()])
 
     def close(self) -> None:
         """Release the window that pictures of other sizes are drawn in."""

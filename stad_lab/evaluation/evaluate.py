@@ -66,8 +66,9 @@ def evaluate(
     # Of V and M as they are loaded: a shipped agent's may be of lower precision.
     weights = {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
     asked = {**identity, "tracks": tracks, **weights}
-    there = unfinished and unfinished.exists()
-    known = load_json(unfinished, "evaluate again", kind=UNFINISHED) if there else {}
+    known = {}
+    if unfinished and unfinished.exists():
+        known = load_json(unfinished, "evaluate again", kind=UNFINISHED)
     driven = known["driven"] if known.get("asked") == asked else {}
     begin = time.perf_counter() - (known["seconds"] if driven else 0)
     missing = [track for track in tracks if str(track) not in driven]

@@ -68,9 +68,9 @@ def vae_metrics(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> dict:
     """
     found, true = reconstruct(vae, frames, earlier), normalise(frames)
     error = ((found.frames - true) ** 2).sum(axis=-1)
-    difference, changed = difference_image(frames, earlier), found.differences
-    if changed is not None:
-        changed = float(((changed - difference) ** 2).sum(axis=(1, 2, 3)).mean())
+    difference, changed = difference_image(frames, earlier), None
+    if found.differences is not None:
+        changed = float(((found.differences - difference) ** 2).sum(axis=(1, 2, 3)).mean())
     regions = {}
     for name, mask in region_masks(frames).items():
         flat = ((true[mask] - true[mask].mean(axis=0, dtype=np.float64)) ** 2).sum(axis=-1).mean()
@@ -212,7 +212,7 @@ def horizon_errors(
         Root mean squared errors at these steps, as a share of that of the mean frame of the step.
     """
     last = decode(vae, mu[:, awake - 1])
-    errors = {"one dream": [], "mean of the dreams": [], "the last frame seen": []}
+    errors: dict[str, list] = {"one dream": [], "mean of the dreams": [], "the last frame seen": []}
     for step in steps:
         true = decode(vae, mu[:, awake + step - 1])
         scale = np.sqrt(true.var(axis=0).mean())

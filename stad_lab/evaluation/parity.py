@@ -3,7 +3,7 @@
 import numpy as np
 
 from stad_lab.config import track_seeds
-from stad_lab.envs.car_racing import MAX_FRAMES, make_env, place_car
+from stad_lab.envs.car_racing import MAX_FRAMES, CarRacing, make_env, place_car
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import to_frame
 from stad_lab.envs.picture import BAR_TOP, HULL_COLUMN, HULL_ROW
@@ -25,18 +25,19 @@ def compare_pictures(number: int, frames: int = MAX_FRAMES) -> tuple[np.ndarray,
         were bit-identical.
     """
     rng, envs = np.random.default_rng(number), [make_env(), make_env(fast=False)]
-    seed, cars, driver = track_seeds("test", 20)[number], envs[0].unwrapped.cars, RandomDriver(rng)
+    seed, fast, driver = track_seeds("test", 20)[number], envs[0].unwrapped, RandomDriver(rng)
+    assert isinstance(fast, CarRacing)
     seen, equal, ended = [env.reset(seed=seed)[0] for env in envs], True, False
     if number % 2:
         start = int(rng.integers(10_000)), rng.uniform(0, 90), 0.15 * rng.standard_normal()
         seen = [place_car(env, *start) for env in envs]
-    errors = [compare(cars, *seen)]
+    errors = [compare(fast.cars, *seen)]
     while len(errors) <= frames and not ended:
         action = driver.act()
         steps = [env.step(action) for env in envs]
         equal &= steps[0][1:] == steps[1][1:]
         ended = any(step[2] or step[3] for step in steps)
-        errors.append(compare(cars, steps[0][0], steps[1][0]))
+        errors.append(compare(fast.cars, steps[0][0], steps[1][0]))
     return np.array(errors), equal
 
 

@@ -54,7 +54,8 @@ def drive_group(
 ) -> Drives:
     """Drive a batch of cars on one thread."""
     single_thread()
-    cars, paths = Cars(len(tracks), "frame", bar=not world_model.crop_bar), [[] for _ in tracks]
+    cars = Cars(len(tracks), "frame", bar=not world_model.crop_bar)
+    paths: list[list] = [[] for _ in tracks]
     cars.reset(tracks)
 
     def note(driving: np.ndarray, _: np.ndarray, __: np.ndarray) -> None:

@@ -46,7 +46,7 @@ def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     return [float(bound) for bound in np.percentile(np.concatenate(means), [2.5, 97.5])]
 
 
-def paired_p(differences: Sequence[float]) -> float:
+def paired_p(differences: Sequence[float] | np.ndarray) -> float:
     """Two-sided p-value of the paired t-test, from the difference of each pair."""
     return float(stats.ttest_1samp(differences, 0.0).pvalue)
 

@@ -45,7 +45,8 @@ class Recorder:
     """Keeps what a trajectory of one car needs, as `observe` of `rollout`."""
 
     def __init__(self, cars: Cars):
-        self.cars, self.rows = cars, []
+        self.cars = cars
+        self.rows: list[tuple] = []
 
     def __call__(self, _: np.ndarray, seen: np.ndarray, actions: np.ndarray) -> None:
         """Keep one moment."""

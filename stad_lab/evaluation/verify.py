@@ -66,28 +66,29 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
     config = Config.from_dict(record["config"])
     dataset, vae = folder / "dataset", folder / VAE_FILE
     models, log = (VAE_FILE, MDN_RNN_FILE), evolution.LOG
-    checks = {  # name -> the check, and the files without which there is nothing to check
-        "record": (lambda: f"ok: {config.variant}",),
-        "dataset": (lambda: verify_dataset(dataset),),
-        "V": (lambda: check_seen(vae, load_vae(vae)[1]["dataset"], dataset) or "ok", VAE_FILE),
-        "M": (lambda: check_mdn_rnn(config, folder) or "ok", MDN_RNN_FILE),
-        "log of CMA-ES": (lambda: verify_log(folder, config), *models, log),
+    # Name -> the check, and the files without which there is nothing to check.
+    checks: dict[str, tuple[Callable[[], str | None], tuple[str, ...]]] = {
+        "record": (lambda: f"ok: {config.variant}", ()),
+        "dataset": (lambda: verify_dataset(dataset), ()),
+        "V": (lambda: check_seen(vae, load_vae(vae)[1]["dataset"], dataset), (VAE_FILE,)),
+        "M": (lambda: check_mdn_rnn(config, folder), (MDN_RNN_FILE,)),
+        "log of CMA-ES": (lambda: verify_log(folder, config), (*models, log)),
         # A C that has lost its V or M fails.
-        "C": (lambda: verify_controller(folder, config), log, CONTROLLER_FILE),
-        "evaluations": (lambda: verify_evaluations(folder),),
-        "episodes": (lambda: drive_again(folder, config, executor), *models, CONTROLLER_FILE),
+        "C": (lambda: verify_controller(folder, config), (log, CONTROLLER_FILE)),
+        "evaluations": (lambda: verify_evaluations(folder), ()),
+        "episodes": (lambda: drive_again(folder, config, executor), (*models, CONTROLLER_FILE)),
     }
     here, found = provenance(""), {}
-    for name, (check, *needed) in checks.items():
+    for name, (check, needed) in checks.items():
         there = all((folder / file).exists() for file in needed)
         found[name] = outcome(check, record, here) if there else MISSING
     return found
 
 
-def outcome(check: Callable[[], str], record: dict, here: dict) -> str:
-    """What a check says; an error that it raises is a failure, unless there is an excuse."""
+def outcome(check: Callable[[], str | None], record: dict, here: dict) -> str:
+    """What a check says, or "ok"; an error that it raises is a failure, if nothing excuses it."""
     try:
-        return check()
+        return check() or "ok"
     except NotRepeated as error:
         made_with = error.args[1:] or starts(record)
         excuses = [other_machine(start, here) for start in made_with]
@@ -149,7 +150,8 @@ def replayed_distance(folder: Path, config: Config, log: dict) -> float:
     """
     if (last := evolution.kept_generation(folder, log)) is None:
         return np.inf
-    space, means = search_space(config, load_world_model(folder), folder), []
+    space = search_space(config, load_world_model(folder), folder)
+    means: list[np.ndarray] = []
     strategy = evolution.make_strategy(space.first, config.evolution, log["random"])
     for number, entry in enumerate(log["generations"][:last]):
         population = evolution.ask(strategy, config.evolution, number)
@@ -210,7 +212,9 @@ def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
             driven = [float(returns[0]) for returns, _ in found]
         else:  # all tracks, because last bits depend on the cars that drive in one batch
             _, log = logged(folder, config)
-            entry = log["generations"][evolution.kept_generation(folder, log) - 1]
+            kept = evolution.kept_generation(folder, log)
+            assert kept is not None  # there is a controller
+            entry = log["generations"][kept - 1]
             recorded = entry["validation"]["returns"][:AGAIN]
             driven = evolution.validate(executor, source, config, parameters)["returns"][:AGAIN]
     if driven != recorded:

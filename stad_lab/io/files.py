@@ -71,7 +71,7 @@ def is_left_over(file: Path, process: int) -> bool:
         return False
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+def write_bytes(path: Path, content: bytes | memoryview) -> None:
     """Write a file so that a crash, or an OSError, leaves the old version or the new one."""
     # A random name, opened exclusively: nobody can have put a link there.
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
@@ -155,7 +155,7 @@ def copy_file(source: Path, folder: Path) -> None:
     write_bytes(folder / source.name, read_bytes(source, "make it again"))
 
 
-def checksum(content: bytes) -> str:
+def checksum(content: bytes | memoryview) -> str:
     """SHA-256 of some bytes, in hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
 

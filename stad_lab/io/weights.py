@@ -7,7 +7,7 @@ checksums of what it depends on: M names its V, and C its V and M.
 import dataclasses
 import functools
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -56,7 +56,7 @@ def load_vae(path: Path) -> tuple[VAE, dict]:
     """
     tensors, metadata = load_kind(path, "vae", "variant", "vae", "crop_bar", "weights", "history")
     vae = VAE.of(config_of(path, metadata))
-    load_into(vae.to(memory_format=torch.channels_last), tensors, path)
+    load_into(vae.to(memory_format=torch.channels_last), tensors, path)  # type: ignore[call-overload]
     return vae.eval().requires_grad_(False), metadata
 
 
@@ -64,7 +64,8 @@ def save_mdn_rnn(
     path: Path, mdn_rnn: MDNRNN, config: Config, history: list | None = None, vae: str | None = None
 ) -> None:
     """Write M with its configuration, its training history and the checksum of its V."""
-    metadata = {"variant": config.variant, "seed": config.seed, "latent_size": mdn_rnn.latent_size}
+    metadata: dict[str, Any] = {"variant": config.variant, "seed": config.seed}
+    metadata |= {"latent_size": mdn_rnn.latent_size}
     settings, weights = dataclasses.asdict(config.mdn_rnn), mdn_rnn.state_dict()
     metadata |= {"mdn_rnn": settings, "vae": vae, "history": history or []}
     save_tensors(path, weights, kind="mdn_rnn", weights=checksum_of_tensors(weights), **metadata)

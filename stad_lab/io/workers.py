@@ -19,6 +19,7 @@ from concurrent.futures import CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import cv2
 import torch
@@ -138,7 +139,8 @@ def start_worker() -> None:
 
 def end_with_parent() -> None:
     """Wait until the parent process has ended, then end this one."""
-    multiprocessing.parent_process().join()
+    if parent := multiprocessing.parent_process():
+        parent.join()
     os._exit(1)
 
 
@@ -154,7 +156,7 @@ def run_tasks(
     tasks: list[tuple],
     ahead: int | None = None,
     patience: float = PATIENCE,
-) -> Iterator[tuple[int, object]]:
+) -> Iterator[tuple[int, Any]]:
     """Call `function(*task)` for every task; yields (its number, its result) as they finish.
 
     Args:
@@ -165,8 +167,9 @@ def run_tasks(
         ValueError, OSError: as raised by a task.
         TaskError: a task failed otherwise, or no task was finished for `patience` seconds.
     """
-    to_begin, waiting = enumerate(tasks), {}
-    name = getattr(getattr(function, "func", function), "__name__", function)
+    to_begin = enumerate(tasks)
+    waiting: dict[Future, int] = {}
+    name = getattr(getattr(function, "func", function), "__name__", str(function))
     try:
         while True:
             for number, task in itertools.islice(to_begin, (ahead or len(tasks)) - len(waiting)):

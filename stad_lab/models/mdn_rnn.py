@@ -120,12 +120,14 @@ def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
 
 def to_state(memory: np.ndarray | None) -> State | None:
     """h and c, float32 (2, batch, hidden_size), as the LSTM takes them: copies; None stays None."""
-    return memory if memory is None else tuple(torch.tensor(part)[None] for part in memory)
+    state = None if memory is None else torch.tensor(memory)
+    return None if state is None else (state[:1], state[1:])
 
 
 def check_temperature(temperature: float) -> None:
     """Raise ValueError unless float32 can divide by the temperature, and it is above 0."""
-    if not 1e-6 <= temperature < math.inf:
+    number = isinstance(temperature, int | float | np.number) and temperature is not True
+    if not number or not 1e-6 <= temperature < 1e30:
         raise ValueError(
-            f"temperature={temperature}: expected a finite number from 1e-6 on; 1 is as trained"
+            f"temperature={temperature!r}: expected a finite number from 1e-6 on; 1 is as trained"
         )

@@ -98,7 +98,7 @@ class VAE(nn.Module):
 class ColourDeconvolution(nn.ConvTranspose2d):
     """A transposed convolution to few channels, kernel 6, stride 2: in half the time forward."""
 
-    def forward(self, pictures: torch.Tensor) -> torch.Tensor:
+    def forward(self, pictures: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
         """(batch, channels, n, n) -> (batch, out_channels, 2 n + 4, 2 n + 4)."""
         return Interleave.apply(pictures, self.weight, self.bias)
 
@@ -136,10 +136,10 @@ class PixelDeconvolution(nn.ConvTranspose2d):
     (batch, channels, 1, 1) -> (batch, out_channels, k, k), in a third of the time.
     """
 
-    def forward(self, pixel: torch.Tensor) -> torch.Tensor:
+    def forward(self, pixel: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
         """Each place of the k x k pixels has its own linear layer."""
         weights = self.weight.permute(0, 2, 3, 1)  # channels, row, column, out_channels
-        bias = self.bias.repeat(self.kernel_size[0] * self.kernel_size[1])
+        bias = self.bias.repeat(self.kernel_size[0] * self.kernel_size[1])  # type: ignore[union-attr]
         made = torch.addmm(bias, pixel.flatten(1), weights.reshape(len(weights), -1))
         return made.view(-1, *weights.shape[1:]).permute(0, 3, 1, 2)
 

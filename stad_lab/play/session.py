@@ -16,7 +16,7 @@ import torch
 from stad_lab.agent import Agent
 from stad_lab.config import TRACK_RANGES
 from stad_lab.dreaming import Dreamer
-from stad_lab.envs.car_racing import make_env
+from stad_lab.envs.car_racing import CarRacing, make_env
 from stad_lab.envs.dream import DreamEnv
 from stad_lab.evaluation.trajectories import Trajectory, true_motion
 from stad_lab.models.mdn_rnn import to_state
@@ -103,10 +103,17 @@ class Session:
     def __init__(self, agent: Agent, track: int = 1):
         self.agent, self.hand, self.driver = agent, Hand(), "hand"
         self.env = make_env()
+        racing = self.env.unwrapped
+        assert isinstance(racing, CarRacing)
+        self.racing = racing
         self.dream = DreamEnv(agent.vae, agent.mdn_rnn, render_mode="rgb_array")
         self.dreamer = Dreamer(self.dream, agent.parameters)
         self.earlier: deque[tuple[int, Trajectory]] = deque(maxlen=4)
+        self.track = track
         self.rows: list[tuple] = []
+        self.dream_rows: list[tuple] = []
+        self.drivers: list[str] = []
+        self.poses: list[tuple] = []
         self.best: dict[int, float] = {}
         self.begin(track)
 
@@ -133,12 +140,12 @@ class Session:
     @property
     def car(self) -> np.ndarray:
         """The real car's state, a record of `physics.CAR`."""
-        return self.env.unwrapped.cars.cars[0]
+        return self.racing.cars.cars[0]
 
     @property
     def road(self) -> np.ndarray:
         """Centres of the track's tiles from above, world units, float64 (tiles, 2)."""
-        return self.env.unwrapped.track[:, 2:]
+        return self.racing.track[:, 2:]
 
     def path(self) -> np.ndarray:
         """Where the real car was in each frame so far, world units, float64 (T, 2)."""
@@ -170,7 +177,8 @@ class Session:
     @on_one_thread()
     def picture(self) -> np.ndarray:
         """What the driver sees: the observation, uint8 (96, 96, 3), or a decoded z, (64, 64, 3)."""
-        return self.observation if self.world == "real" else self.dream.render()
+        decoded = self.dream.render() if self.world == "dream" else None
+        return self.observation if decoded is None else decoded
 
     def trajectory(self) -> Trajectory:
         """The real episode so far. ValueError if nothing was driven yet."""
@@ -190,7 +198,7 @@ class Session:
         return DreamTrajectory(*map(np.array, zip(*self.dream_rows, strict=True)))
 
     def _step_real(self, driver: str) -> None:
-        action, motion = self._act(driver, self.proposed), true_motion(self.env.unwrapped.cars)
+        action, motion = self._act(driver, self.proposed), true_motion(self.racing.cars)
         if driver == "hand":  # M remembered the agent's action: replace it by the human's
             self.agent.remember(action[None], self.before)
         pose = pose_of(self.car)
@@ -199,7 +207,7 @@ class Session:
         self.drivers.append(driver)
         self.poses.append(pose)
         self.rows.append((self.observation, action, reward, motion))
-        self.observation, self.score = following, self.score + reward
+        self.observation, self.score = following, self.score + float(reward)
         self.real_ended = terminated or truncated
         if self.real_ended and set(self.drivers) == {"hand"}:
             self.best[self.track] = max(self.score, self.best.get(self.track, self.score))

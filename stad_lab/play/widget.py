@@ -80,7 +80,8 @@ class Seat:
 
     def __init__(self, session: Session):
         stop_loops()
-        self.session, self.loop, self.pace, self.error = session, None, 0.0, ""
+        self.session, self.pace, self.error = session, 0.0, ""
+        self.loop: Loop | None = None
         self.lock, self.described = threading.RLock(), 0.0  # when the status was last written
         self.ghost: Ghost | None = None  # the agent's lap of the present track
         self.picture = marked(ipywidgets.Image(format="png", width=SIZE, height=SIZE), "pixels")
@@ -175,11 +176,12 @@ class Seat:
         self.world.value, self.go.value = "real", True
         self.show()
 
-    def _prepare(self) -> None:
+    def _prepare(self) -> Ghost:
         """Let the agent drive its own lap of the track, and draw what does not move."""
         if self.ghost is None or self.ghost.track != self.session.track:
             self.ghost = drive_ghost(self.session.agent, self.session.track)
         self.ground.value = draw_background(self.session.road)
+        return self.ghost
 
     def advance(self) -> bool:
         """Drive and show one frame; False if the episode has ended."""
@@ -198,9 +200,10 @@ class Seat:
     def show(self, every: float = 0.0) -> None:
         """Show the picture, and the status unless it is younger than `every` seconds."""
         with self.lock:
-            if self.ghost.track != self.session.track:  # another cell began an episode
-                self._prepare()
-            picture, drawn = self.session.picture(), draw_moment(self.session, self.ghost)
+            ghost = self.ghost
+            if ghost is None or ghost.track != self.session.track:  # another cell began an episode
+                ghost = self._prepare()
+            picture, drawn = self.session.picture(), draw_moment(self.session, ghost)
         cropped = self.session.world == "dream" and self.session.agent.world_model.crop_bar
         self.picture.height = str(SIZE - STRIP if cropped else SIZE)  # the road in its proportions
         self.picture.value = picture_png(picture, len(picture))
@@ -216,7 +219,7 @@ class Seat:
             pace = self.pace if self.go.value else 0.0
             self.status.value = describe(self.session, pace, self.error)
             if self.session.real_ended:  # for screen readers: the picture's card is a drawing
-                told = html.escape(". ".join(end_lines(self.session, self.ghost)))
+                told = html.escape(". ".join(end_lines(self.session, ghost)))
                 self.status.value += f'<div style="line-height: 1.4">{told}</div>'
 
     def browser_is_behind(self) -> bool:

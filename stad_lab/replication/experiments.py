@@ -7,6 +7,7 @@ dimensions on, and by cumulative step-size adaptation (CSA) below; the configura
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from stad_lab.config import VARIANTS, Config
 from stad_lab.training.fine_tuning import FINE_TUNING
@@ -37,7 +38,7 @@ EARLY_RECIPE = {
 }  # fmt: skip
 # Single changes of "one_iteration": the experiment whose dataset, V and M are shared (None: own
 # ones) -> experiment -> (what it is, the change). The variant is `input`.
-CHANGES = {
+CHANGES: dict[str | None, dict[str, tuple[str, dict[str, Any]]]] = {
     None: {
         "another_seed": ("everything from another seed", {"seed": 1}),
         **{f"stride_{k}": (f"stride {k}", {"vae": {"stride": k}}) for k in (1, 2, 8)},
@@ -83,22 +84,24 @@ class Experiment:
 
 def make_experiments() -> dict[str, Experiment]:
     """All experiments by name."""
-    found = {}
+    found: dict[str, Experiment] = {}
     for name in VARIANTS:
         paper = Config.preset("paper", variant=name, evolution={"step_size_rule": "TPA"})
         no_bar = Config.preset("laptop", variant=name)
         first = no_bar.replace(data={"crop_bar": False}, evolution={"generations": 15})
         two = first.replace(**SECOND_ITERATION)
-        tuned, base = two.replace(**FINE_TUNING), f"two_iterations_{name}"
-        for recipe, fields in {
+        tuned, its_base = two.replace(**FINE_TUNING), f"two_iterations_{name}"
+        recipes: dict[str, dict[str, Any]] = {
             "paper": {"config": paper},
             "two_iterations": {"config": two, "first": first},
-            "fine_tuned": {"config": tuned, "base": base},
+            "fine_tuned": {"config": tuned, "base": its_base},
             "first_iteration": {"config": first, "seeds": (0, 1, 2, 3, 4), "retrained": True},
             "no_bar": {"config": no_bar, "seeds": (0, 1), "retrained": True},
-        }.items():
+        }
+        for recipe, fields in recipes.items():
             found[f"{recipe}_{name}"] = Experiment(RECIPES[recipe], **fields)
     base = found["two_iterations_input"]
+    assert base.first is not None
     one_iteration = base.first.replace(evolution={"generations": 55})
     found["one_iteration"] = Experiment("one iteration", one_iteration)
     for world_model, changed in CHANGES.items():
@@ -106,10 +109,11 @@ def make_experiments() -> dict[str, Experiment]:
             config = found[world_model or "one_iteration"].config.replace(**changes)
             found[name] = Experiment(about, config, None, (0,), world_model)
     only_new, about = base.config.replace(evolution={"replay_share": 0.0}), "two iterations, "
-    early = [one.replace(**EARLY_RECIPE) for one in (base.config, base.first)]
+    early, early_first = (one.replace(**EARLY_RECIPE) for one in (base.config, base.first))
+    improved = "before the recipe was improved"
     return found | {
         "no_replay": Experiment(about + "new tracks only", only_new, base.first, (0,)),
-        "early_recipe": Experiment(about + "before the recipe was improved", *early, (0,)),
+        "early_recipe": Experiment(about + improved, early, early_first, (0,)),
     }
 
 

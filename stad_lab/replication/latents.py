@@ -14,7 +14,7 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -118,7 +118,11 @@ def random_trajectories(count: int, seed: int, processes: int) -> list[Trajector
         return run_in_order(executor, record_random_trajectory, tasks, "random driver")
 
 
-def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, tuple]:
+# The trajectories of a driver, and how many first frames of each are not probed.
+Driven = tuple[list[Trajectory], int]
+
+
+def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, Driven]:
     """The random driver's trajectories, and a third as many of AGENT: the road at speed.
 
     Returns driver -> (trajectories, number of first frames of each that are not probed).
@@ -250,7 +254,11 @@ def mdn_rnn_part(study: Study) -> dict:
     """Measure M of every variant; for `input` also the reduced M."""
     whole = [one for one in study.trajectories if len(one) == RANDOM_FRAMES]
     actions = np.array([one.actions for one in whole])
-    result = {"whole_trajectories": len(whole), "horizon_steps": HORIZON, "variants": {}}
+    result: dict[str, Any] = {
+        "whole_trajectories": len(whole),
+        "horizon_steps": HORIZON,
+        "variants": {},
+    }
     for variant, model in shipped():
         how = model.stride, model.crop_bar
         encoded = [encode_trajectory(model.vae, one, *how) for one in whole]

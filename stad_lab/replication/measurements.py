@@ -17,7 +17,7 @@ REFERENCES = ("Gymnasium", "V + M + C, 1 thread", "stad_lab")
 
 def describe_probe(probe: pandas.DataFrame) -> dict:
     """R2 by "DRIVER: WORLD_MODEL-SEED", features and quantity."""
-    found = defaultdict(lambda: defaultdict(dict))
+    found: dict = defaultdict(lambda: defaultdict(dict))
     for one in probe.itertuples():
         name = f"{one.driver}: {key(one.world_model, one.seed)}"
         found[name][one.features][one.quantity] = one.r2
@@ -26,7 +26,7 @@ def describe_probe(probe: pandas.DataFrame) -> dict:
 
 def describe_models(metrics: pandas.DataFrame) -> dict:
     """Values by "MODEL: WORLD_MODEL" and metric, and by index where a metric has several."""
-    found = defaultdict(dict)
+    found: dict = defaultdict(dict)
     for (model, world_model, metric), own in metrics.groupby(["model", "world_model", "metric"]):
         values = dict(zip(own["index"], own["value"].tolist(), strict=True))
         found[f"{model}: {world_model}"][metric] = values.get("all", values)

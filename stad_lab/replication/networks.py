@@ -60,7 +60,7 @@ def load_kept_world_model(path: Path) -> WorldModel:
     config = config_of(path, metadata)
     vae, mdn_rnn = VAE.of(config), MDNRNN.of(config)
     del vae.decoder, mdn_rnn.head
-    vae = vae.to(memory_format=torch.channels_last)
+    vae = vae.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     for name, network in (("vae.", vae), ("mdn_rnn.", mdn_rnn)):
         own = {key.removeprefix(name): one for key, one in tensors.items() if key.startswith(name)}
         load_into(network, own, path)

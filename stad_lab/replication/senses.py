@@ -7,7 +7,7 @@ least change after which no linear model can read them (LEACE: Belrose et al. 20
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -149,9 +149,10 @@ class SensingAgent(Agent):
     def reset(self) -> None:
         """Forget the past."""
         super().reset()
-        self.frame, self.actions = 0, None
+        self.frame = 0
+        self.actions: Any = None  # an array from the first step on
 
-    def act_batch(self, seen: np.ndarray) -> np.ndarray:
+    def act_batch(self, seen: Sequence[np.ndarray] | np.ndarray) -> np.ndarray:
         """The actions of the present cars, float32 (cars, 3)."""
         if self.actions is None:
             self.actions = np.zeros((len(seen), 3), np.float32)

@@ -113,14 +113,14 @@ def find_pipelines(
     if study not in STUDIES:
         raise ValueError(f"unknown study {study!r}: choose one of {', '.join(STUDIES)}")
     asked = STUDIES[study]
-    if unknown := set(seeds or ()) - set(asked.seeds):
+    if other := set(seeds or ()) - set(asked.seeds):
         known = f"{min(asked.seeds)} to {max(asked.seeds)}"
-        raise ValueError(f"study {study!r} has no seed {min(unknown)}: it has {known}")
+        raise ValueError(f"study {study!r} has no seed {min(other)}: it has {known}")
     chosen = [seed for seed in asked.seeds if not seeds or seed in seeds]
     arms = [(variant, features) for variant in asked.variants for features in asked.features]
     found = [Pipeline(study, *arm, seed) for seed in chosen for arm in arms]
     names = [pipeline.name for pipeline in found]
-    if unknown := [name for name in only or () if name not in names]:
+    if unknown := [name for name in only or [] if name not in names]:
         example = f"expected a name such as {names[0]!r}"
         raise ValueError(f"study {study!r} has no pipeline {unknown[0]!r}: {example}")
     return [pipeline for pipeline in found if not only or pipeline.name in only]
@@ -344,7 +344,7 @@ CHECKSUMS = ("dataset", "vae", "mdn_rnn", "log", "kept_world_model", "kept_contr
 
 def compare(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> str:
     """Whether a pipeline that was run again is, bit by bit, the one in the tables."""
-    was, now = recorded(pipeline, to), describe_run(pipeline, root)
+    was, now = recorded(pipeline, to) or {}, describe_run(pipeline, root)
     table = tables.read_study("episodes", to)
     before = table[(table[PIPELINE] == list(pipeline)).all(axis=1)].set_index("track")["return"]
     score = load_json(root / pipeline.name / SCORE, kind="score")

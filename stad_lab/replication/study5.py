@@ -81,9 +81,9 @@ def find_runs(
 ) -> list[Run]:
     """The runs, part by part and seed by seed. ValueError for an unknown seed or name."""
     planned = STUDIES["study1"].seeds
-    if unknown := set(seeds or ()) - set(planned):
+    if other := set(seeds or ()) - set(planned):
         known = f"{min(planned)} to {max(planned)}"
-        raise ValueError(f"study 5 has no seed {min(unknown)}: it has {known}")
+        raise ValueError(f"study 5 has no seed {min(other)}: it has {known}")
     found = [
         Run(seed, *arm, repeat)
         for part in parts
@@ -93,7 +93,7 @@ def find_runs(
         if not seeds or seed in seeds
     ]
     names = [run.name for run in found]
-    if unknown := [name for name in only or () if name not in names]:
+    if unknown := [name for name in only or [] if name not in names]:
         raise ValueError(f"study 5 has no run {unknown[0]!r}: expected a name such as {names[0]!r}")
     return [run for run in found if not only or run.name in only]
 
@@ -149,9 +149,9 @@ def run_one(run: Run, root: Path, networks: Path = NETWORKS) -> dict:
             depends_on = {"variant": run.variant, "features": run.config.evolution.features}
             count = run.config.evolution.components
             metadata = {**depends_on, "count": count, **sense.checksums}
-            save_components(folder / COMPONENTS_FILE, *components, **metadata)
-        evolve(run.config, folder, drives=sense)
-        log = read_log(run.config, folder, sense)
+            save_components(folder / COMPONENTS_FILE, *components, metadata)
+        evolve(run.config, folder, drives=sense)  # type: ignore[arg-type]  # only read
+        log = read_log(run.config, folder, sense)  # type: ignore[arg-type]
         controller = resume(run.config, folder, sense, log).controller().astype(np.float16)
         score = score_controller(sense, controller)
     seconds = time.perf_counter() - begin

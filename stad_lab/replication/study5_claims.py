@@ -5,6 +5,7 @@ only the progress is reported: nothing is tested earlier.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,9 @@ from stad_lab.replication import tables
 from stad_lab.replication.study5 import ARMS, REPEATS, find_runs
 from stad_lab.replication.study_claims import compare, find_verdict
 
-FAMILIES = {  # the parts that must be complete -> comparison -> arms added and subtracted
+Families = dict[tuple[str, ...], dict[str, tuple[dict[str, float], ...]]]
+
+FAMILIES: Families = {  # the parts that must be complete -> comparison -> arms added and subtracted
     ("5a",): {
         "interaction": (
             {"input_output: z": 1, "frame: z, h": 1},
@@ -29,7 +32,7 @@ FAMILIES = {  # the parts that must be complete -> comparison -> arms added and 
         "erasing motion": ({"input_output: z - motion": 1}, {"input_output: z - placebo": 1}),
     },
 }
-DESCRIBED = {  # without a test
+DESCRIBED: Families = {  # without a test
     ("5c",): {
         "both with motion": ({"input_output: z + motion": 1}, {"frame: z + motion": 1}),
         "remembering the action": ({"frame: z + action": 1}, {"frame: z + placebo": 1}),
@@ -46,7 +49,10 @@ def describe_study5(folder: Path = tables.DATA) -> dict:
     done = set(table[tables.SENSED].itertuples(index=False, name=None))
     planned = {part: find_runs(parts=[part]) for part in ARMS}
     counts = {part: sum(tuple(run) in done for run in runs) for part, runs in planned.items()}
-    found = {"runs": counts, "planned": {part: len(runs) for part, runs in planned.items()}}
+    found: dict[str, Any] = {
+        "runs": counts,
+        "planned": {part: len(runs) for part, runs in planned.items()},
+    }
     complete = [part for part in ARMS if counts[part] == len(planned[part])]
     scores = scores_of(complete, folder)
     found["arms"] = {arm: describe_arm(own) for arm, own in scores.items()}

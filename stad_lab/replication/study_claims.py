@@ -5,6 +5,7 @@ its last pipeline is in the tables, only the progress is reported: nothing is te
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas
@@ -33,7 +34,7 @@ def describe_study1(folder: Path = tables.DATA, study: str = "study1") -> dict:
     returns = returns_of_study(study, folder)
     curves = learning_curves(study, folder)
     areas = {arm: area_under(*curve) for arm, curve in curves.items()}
-    comparisons = {}
+    comparisons: dict[str, dict] = {}
     for variants in FAMILIES.values():
         comparisons |= compare_family(returns, areas, variants)
     arms = {arm: describe_arm(own, areas[arm]) for arm, own in returns.items()}
@@ -205,7 +206,10 @@ def describe_study3(folder: Path = tables.DATA, study: str = "study1") -> dict:
     """
     table = tables.read_study("probe", folder)
     table = table[table["study"] == study]
-    found = {"seeds": int(table["seed"].nunique()), "planned_seeds": len(STUDIES[study].seeds)}
+    found: dict[str, Any] = {
+        "seeds": int(table["seed"].nunique()),
+        "planned_seeds": len(STUDIES[study].seeds),
+    }
     probed = table[table["trained"].astype(bool)]
     found["networks"] = len(probed[["variant", "seed"]].drop_duplicates())
     if found["seeds"] < 2:

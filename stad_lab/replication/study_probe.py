@@ -99,7 +99,8 @@ def kept_world_models(study: str, seed: int, to: Path, networks: Path) -> dict[s
         files[variant] = networks / study / f"seed{seed}" / variant / WORLD_MODEL_FILE
         if not files[variant].exists():
             raise FileNotFoundError(f"{files[variant]} is not there: {how_to_get(study)}")
-        if checksum(files[variant].read_bytes()) != recorded(pipeline, to)["kept_world_model"]:
+        line = recorded(pipeline, to) or {}
+        if checksum(files[variant].read_bytes()) != line.get("kept_world_model"):
             raise ValueError(f"{files[variant]} is not the file of the recorded run")
     return files
 

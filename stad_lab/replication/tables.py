@@ -145,7 +145,8 @@ def add_speed(file: Path, to: Path = DATA) -> None:
 
 def check_evaluation(path: Path, found: dict, experiment: str, controller: str | None) -> None:
     """Raise ValueError unless an evaluation is of this experiment's agent, on the test tracks."""
-    wanted = {"variant": experiment}  # a driver without V sees no picture, of whatever renderer
+    # A driver without V sees no picture, of whatever renderer.
+    wanted: dict[str, str | None] = {"variant": experiment}
     if experiment not in BASELINE_DRIVERS:
         variant = EXPERIMENTS[experiment].config.variant
         wanted = {"variant": variant, "renderer": "gymnasium", "controller": controller}

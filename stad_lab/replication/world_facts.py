@@ -91,7 +91,8 @@ def placebo_episodes() -> list[np.ndarray]:
     found = []
     for start in range(0, len(tracks), CARS):
         own = tracks[start : start + CARS]
-        cars, rows = Cars(len(own), "frame", bar=not agent.world_model.crop_bar), [[] for _ in own]
+        cars = Cars(len(own), "frame", bar=not agent.world_model.crop_bar)
+        rows: list[list] = [[] for _ in own]
         cars.reset(own)
 
         def observe(which: np.ndarray, *_, cars: Cars = cars, rows: list = rows) -> None:
@@ -187,7 +188,7 @@ def measure_erasure(model: WorldModel, processes: int = 2) -> dict[str, dict[str
     """
     drivers = two_drivers(random_trajectories(PROBED, PROBE_SEED, processes), processes)
     erasers = fit_erasers(model, *drivers["trained agent"], random_stream("bootstrap", 0, 5))
-    found = {}
+    found: dict = {}
     for driver, (driven, skip) in drivers.items():
         latents, motion, number = rows_in_sight(model, driven, skip)
         found[driver] = {}

@@ -166,7 +166,7 @@ def collect_episodes(
 def save_episode(folder: Path, index: int, episode: Episode) -> dict:
     """Write the files of an episode; returns its entry in the manifest."""
     frames, actions, track = episode
-    entry = {"index": index, "track": track, "frames": len(frames)}
+    entry: dict[str, int | str] = {"index": index, "track": track, "frames": len(frames)}
     for name, array in (("frames", frames), ("actions", actions)):
         buffer = io.BytesIO()
         np.save(buffer, array, allow_pickle=False)
@@ -213,7 +213,7 @@ class EpisodeFrames(Sequence):
     def __len__(self) -> int:
         return len(self.paths)
 
-    def __getitem__(self, index: int) -> np.ndarray:
+    def __getitem__(self, index: int) -> np.ndarray:  # type: ignore[override]  # no slices
         return np.load(self.paths[index], allow_pickle=False)
 
     def read(self, index: int, moments: list[int], into: list[np.ndarray]) -> None:

@@ -127,7 +127,7 @@ def run_generation(run: Evolution, executor: Executor, source: Any) -> None:
         keep_controller(run, run.controller())
 
 
-def read_log(config: Config, folder: Path, world_model: WorldModel) -> dict:
+def read_log(config: Config, folder: Path, world_model: WorldModel | Drives) -> dict:
     """The log of the run in `folder`, or a new one; ValueError if it is damaged or does not fit."""
     path, settings = folder / LOG, dataclasses.asdict(config.evolution)
     made_with = {"variant": config.variant, "seed": config.seed, "evolution": settings}
@@ -224,7 +224,7 @@ def replay(
 
     ValueError if a mean is not the logged one.
     """
-    strategy, means = make_strategy(start, settings, log["random"]), []
+    strategy, means = make_strategy(start, settings, log["random"]), list[np.ndarray]()
     for number, entry in enumerate(log["generations"]):
         population = ask(strategy, settings, number)
         tell(strategy, population, entry["returns"], means)
@@ -293,11 +293,11 @@ def generation_tracks(config: Config, earlier: list[dict]) -> list[int]:
     replayed = int((number + 1) * share) - int(number * share)
     if not replayed:
         return new
-    last_mean = {}
+    last_mean: dict[int, float] = {}
     for entry in earlier[-REMEMBERED:]:
         last_mean |= dict(zip(entry["tracks"], np.mean(entry["returns"], axis=0), strict=True))
     resting = {track for entry in earlier[-RESTING:] for track in entry["tracks"]}
-    hard = sorted(last_mean.keys() - resting, key=last_mean.get)
+    hard = sorted(last_mean.keys() - resting, key=lambda track: last_mean[track])
     return (hard[:replayed] + new)[: settings.tracks]
 
 
@@ -347,7 +347,8 @@ def drive_parallel(
     limits = {"max_frames": settings.max_frames, "patience": settings.patience}
     tasks = [(source, parameters[group], tracks[group], True, limits) for group in groups]
     found = run_in_order(executor, drive_group, tasks)
-    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+    returns, lengths = zip(*found, strict=True)
+    return np.concatenate(returns), np.concatenate(lengths)
 
 
 def drive_group(

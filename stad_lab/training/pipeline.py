@@ -115,7 +115,7 @@ def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) 
         return collect(config, data, pool)
 
     def controller_stage(pool: Executor) -> bool:
-        did = bool(earlier) and second_iteration.carry_over(config, earlier, dataset, folder)
+        did = earlier is not None and second_iteration.carry_over(config, earlier, dataset, folder)
         did |= find_components(config, dataset, folder)
         return did | evolve(config, folder, pool)
 

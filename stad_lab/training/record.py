@@ -11,6 +11,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -64,7 +65,7 @@ def open_record(config: Config, folder: Path, before: dict | None, made: dict) -
     "earlier" is the record of the run that this one continues.
     """
     path = folder / RECORD
-    new = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
+    new: dict[str, Any] = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
     if not path.exists():
         earlier = {} if before is None else {"earlier": before}
         return {**new, "made_with": made, "seconds": {}, **earlier}
@@ -190,7 +191,7 @@ def budget(config: Config, folder: Path, data: Path | None) -> dict:
 
     Those of an earlier run are in its own record; `total_budget` adds them.
     """
-    spent = defaultdict(Counter, random=Counter(episodes=0, frames=0))
+    spent: dict = defaultdict(Counter, random=Counter(episodes=0, frames=0))
     count = config.data.episodes
     again = config.data.agent_episodes > 0
     order = second_iteration.order_of_episodes(config) if again else range(count)

@@ -9,6 +9,7 @@ in z and h, so the result is an ordinary C.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -81,7 +82,7 @@ def find_components(config: Config, dataset: Callable[[], Dataset], folder: Path
     if not count:
         return False
     path, world_model = Path(folder) / COMPONENTS_FILE, load_world_model(Path(folder))
-    depends_on = {"count": count, "features": config.evolution.features}
+    depends_on: dict[str, Any] = {"count": count, "features": config.evolution.features}
     if path.exists():
         load_directions(path, world_model)  # raises if they are of another world model
         was = depends_on | load_kind(path, "components")[1]
@@ -92,11 +93,14 @@ def find_components(config: Config, dataset: Callable[[], Dataset], folder: Path
     seen = (features_of(world_model, *episode) for episode in episodes)
     columns = seen_columns(config.evolution.features, *world_model.sizes)
     found = principal_components(seen, columns, count)
-    save_components(path, *found, variant=config.variant, **depends_on, **world_model.checksums)
+    metadata = {"variant": config.variant, **depends_on, **world_model.checksums}
+    save_components(path, *found, metadata)
     return True
 
 
-def save_components(path: Path, middle: np.ndarray, components: np.ndarray, **metadata) -> None:
+def save_components(
+    path: Path, middle: np.ndarray, components: np.ndarray, metadata: dict[str, Any]
+) -> None:
     """Write what `principal_components` found."""
     tensors = {"middle": torch.from_numpy(middle), "components": torch.from_numpy(components)}
     save_tensors(path, tensors, kind="components", **metadata)

@@ -10,10 +10,11 @@ import math
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import nn
@@ -61,7 +62,7 @@ def fit(training: Training) -> list[dict]:
     optimizer = Adam(training.model.parameters(), lr=0.0, fused=True)
     history = load_state(training, optimizer) if training.checkpoint.exists() else []
     start, steps = history[-1]["step"] if history else 0, training.steps
-    every, sums, step = max(1, steps // ENTRIES), Counter(), start
+    every, sums, step = max(1, steps // ENTRIES), Counter[str](), start
     if training.watch and history:
         training.watch(history)
     batches = read_ahead(training.batch, range(start, steps))
@@ -86,7 +87,7 @@ def fit(training: Training) -> list[dict]:
     return history
 
 
-def entry(training: Training, step: int, history: list[dict], sums: dict[str, float]) -> dict:
+def entry(training: Training, step: int, history: list[dict], sums: Mapping[str, float]) -> dict:
     """The history's entry after a step, from the sums of the losses since the last entry."""
     count = step + 1 - (history[-1]["step"] if history else 0)
     with torch.no_grad():
@@ -122,7 +123,7 @@ def check_finite(total: float, label: str, step: int) -> None:
 def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[int, tuple]]:
     """Every step with its batch, which a thread reads while the step before is trained."""
     with ThreadPoolExecutor(1) as reader:
-        following = reader.submit(batch, steps.start) if steps else None
+        following: Any = reader.submit(batch, steps.start) if steps else None
         for step in steps:
             present = following
             following = reader.submit(batch, step + 1) if step + 1 < steps.stop else None

@@ -46,7 +46,7 @@ def train_vae(
     data = dataset()
     with locked(path.parent), torch_settings(config.seed, 0) as device:
         vae = VAE.of(config)
-        vae.to(device, memory_format=torch.channels_last)
+        vae.to(device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         training = vae_training(config, data, vae, path.with_name(CHECKPOINT))
         training.watch = watch
         history = fit(training)

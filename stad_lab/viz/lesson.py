@@ -8,6 +8,7 @@ Without an answer, or without a kernel, a lesson reads on all the same.
 
 from collections.abc import Sequence
 from html import escape
+from typing import cast
 
 import ipywidgets
 from IPython.display import HTML, DisplayHandle
@@ -33,7 +34,9 @@ class Prediction(ipywidgets.VBox):
 
     def __init__(self, question: str, control: ipywidgets.Widget, choices: str, unit: str = ""):
         self.question, self.control, self.choices, self.unit = question, control, choices, unit
-        self.answer, self.revealed, self.place = None, None, None
+        self.answer: str | float | None = None
+        self.revealed: tuple[str | float, str] = "", ""  # the result, and why
+        self.place: DisplayHandle | None = None
         control.observe(self._keep, "value")
         heading = ipywidgets.HTML(f"<b>Predict.</b> {escape(question)}")
         super().__init__([heading, control])
@@ -86,8 +89,8 @@ def predict(
     """
     if isinstance(options[0], str):
         control = ipywidgets.RadioButtons(options=options, value=None, layout=WIDE)
-        return Prediction(question, control, " / ".join(options))
-    low, high = options
+        return Prediction(question, control, " / ".join(map(str, options)))
+    low, high = (cast(float, limit) for limit in options)
     whole = isinstance(low, int) and isinstance(high, int)
     kind = ipywidgets.IntSlider if whole else ipywidgets.FloatSlider
     step = 1 if whole else (high - low) / 100

@@ -7,12 +7,14 @@ which colour-blind readers can distinguish; difference images share a diverging 
 import io
 from collections.abc import Callable, Iterable
 from itertools import cycle, product
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.patches import Ellipse
 
 from stad_lab.envs.track import TRACK_WIDTH
@@ -28,7 +30,7 @@ STYLES = [(color, DASHES[(i + turn) % 4]) for turn in range(4) for i, color in e
 MARKERS = "os^DvP"
 DIFFERENCE_MAP = "PuOr_r"
 THIN = {"color": "grey", "lw": 0.8, "ls": ":"}  # a line for reference
-SMALL = {"frameon": False, "fontsize": 9}  # a legend
+SMALL: dict[str, Any] = {"frameon": False, "fontsize": 9}  # a legend
 
 
 def new_figure(
@@ -46,7 +48,7 @@ def describe(figure: Figure, title: str, lead: str, values: Iterable[str] = ()) 
     return figure
 
 
-def show_picture(axis: Axes, picture: np.ndarray, **scale) -> object:
+def show_picture(axis: Axes, picture: np.ndarray, **scale) -> AxesImage:
     """A picture in an axis without ticks and border; returns what a colour bar needs."""
     axis.set(xticks=[], yticks=[])
     axis.spines[:].set_visible(False)
@@ -200,7 +202,8 @@ def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> 
     if not 0 <= moment < length:
         raise ValueError(f"moment={moment}: expected 0 to {length - 1}, a frame of the episode")
     figure = Figure(figsize=(9.5, 5.6), layout="constrained", dpi=100)
-    above, middle, below = figure.subfigures(3, 1, height_ratios=[1.6, 1.25, 0.8])
+    parts: Any = figure.subfigures(3, 1, height_ratios=[1.6, 1.25, 0.8])
+    above, middle, below = parts
     pictures = {
         "observation": trajectory.observations[moment],
         "frame x": inspection.frames[moment],
@@ -289,7 +292,7 @@ def plot_scatter(
     figure, axes = new_figure(*size, 1, len(panels), sharex=True, sharey=True)
     for axis, (name, points), color in zip(axes[0], panels.items(), cycle(COLORS), strict=False):
         caption(axis, name, xlabel)
-        if name not in (values or {}):
+        if values is None or name not in values:
             axis.scatter(*points, s=3, alpha=0.4, color=color)
             continue
         low, high = np.quantile(values[name], [0.02, 0.98])
@@ -523,6 +526,7 @@ def plot_intervals(
     lines, width = -(-len(panels) // columns), 2.0 + 2.5 * columns if columns > 1 else 6.5
     height = lines * (max(0.32, 0.11 * len(names)) * len(rows) + 0.75) + 0.7  # inches
     figure, axes = new_figure(width, height, lines, columns, sharex=True, sharey=True)
+    lowest = -np.inf if limits is None else limits[0]
     # Nobody would listen to a longer alternative text.
     read, values = names if sum(map(len, contents)) <= 40 else names[:1], []
     for axis, (panel, found) in zip(axes.flat, panels.items(), strict=False):
@@ -531,8 +535,8 @@ def plot_intervals(
                 continue
             (value, interval, *single), (mark, color, shift) = found[row][name], styles[name]
             y = place + (shift if len(found[row]) > 1 else 0)
-            outside = limits is not None and value < limits[0]
-            x, mark = (limits[0], "<") if outside else (value, mark)
+            outside = value < lowest
+            x, mark = (lowest, "<") if outside else (value, mark)
             axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.5)
             axis.plot(x, y, mark, color=color, ms=5, clip_on=not outside)
             for places in single:
@@ -668,5 +672,5 @@ def plot_dream(
     axis.set(xlabel="steps dreamed", ylabel="error (best constant = 1)", ylim=(0, None))
     axis.legend(**SMALL, loc="lower right")
     title = f"Step {moment + 1} of a dream ({(moment + 1) / 50:.1f} seconds)"
-    values = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
-    return describe(figure, title, "Real frame, dreamed frame, and errors at this step: ", values)
+    now = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
+    return describe(figure, title, "Real frame, dreamed frame, and errors at this step: ", now)

@@ -1,5 +1,7 @@
 """The figures of the studies that docs/protocol.md fixes."""
 
+from typing import Any
+
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -64,7 +66,11 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
 
 def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:
     """A line of a forest plot: the interval and the mean, and above them the seeds."""
-    seeds = {"markerfacecolor": "white", "markeredgecolor": colour, "linestyle": "none"}
+    seeds: dict[str, Any] = {
+        "markerfacecolor": "white",
+        "markeredgecolor": colour,
+        "linestyle": "none",
+    }
     axis.plot(
         one["interval"], [height] * 2, color=colour, linewidth=2.5, label="mean, 95% interval"
     )

@@ -88,7 +88,7 @@ def repeated_dreams(
     Returns a picture for each frame from `first` on, uint8 (len(trajectory) - first, 64, 64, 3).
     """
     agent.reset()
-    dreams = []
+    dreams: list[np.ndarray] = []
     for moment, observation in enumerate(trajectory.observations):
         agent.act(observation)  # as in the episode, so that M has its memory of that moment
         if moment >= first and (moment - first) % length == 0:

@@ -26,7 +26,8 @@ from stad_lab.viz.video import enlarged
 
 def show(*figures: Figure) -> HTML:
     """Figures as pictures, one below the other, each with its alternative text (its label)."""
-    return HTML("".join(show_picture(to_png(one), "png", one.get_label()).data for one in figures))
+    pictures = [show_picture(to_png(one), "png", str(one.get_label())) for one in figures]
+    return HTML("".join(one.data for one in pictures))
 
 
 def show_animation(gif: bytes, alt: str) -> HTML:

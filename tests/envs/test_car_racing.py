@@ -220,7 +220,7 @@ def test_a_place_that_is_no_number_is_refused_and_the_car_stays(how):
     env = make_env().unwrapped
     env.reset(seed=0)
     before = env.cars.cars.copy()
-    with pytest.raises(ValueError, match="expected a whole number and three finite ones"):
+    with pytest.raises(ValueError, match=r"expected a (whole|finite) number"):
         env.place(**how)
     assert np.array_equal(before, env.cars.cars)
 

@@ -96,7 +96,7 @@ def test_the_info_of_a_dream_holds_m_s_memory(dream, agent):
 @pytest.mark.parametrize("action", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0], [[0, 0, 0]]])
 def test_an_action_that_is_not_three_finite_numbers_is_refused(action, dream):
     dream.reset(seed=0)
-    with pytest.raises(ValueError, match=r"action \[.*\]: expected finite steering, gas and brake"):
+    with pytest.raises(ValueError, match=r"action .*: expected .*, steering, gas and brake"):
         dream.step(np.array(action, np.float32))
 
 
@@ -128,7 +128,7 @@ def test_a_temperature_that_cannot_be_sampled_is_refused(temperature, agent):
 
 
 def test_another_render_mode_is_refused(agent):
-    with pytest.raises(ValueError, match="render_mode='human': expected 'rgb_array' or None"):
+    with pytest.raises(ValueError, match="render_mode='human': choose one of None, rgb_array"):
         DreamEnv(agent.vae, agent.mdn_rnn, render_mode="human")
 
 
@@ -207,7 +207,7 @@ def test_an_agent_that_has_not_acted_cannot_dream(agent):
 def test_a_dream_of_no_frame_is_refused(agent, observations):
     agent.reset()
     agent.act(observations[0])
-    with pytest.raises(ValueError, match="frames=0: expected at least 1"):
+    with pytest.raises(ValueError, match="max_frames=0: expected a whole number from 1"):
         dream_on(agent, 0)
 
 

@@ -114,7 +114,7 @@ def test_seeds_count_up_from_one_number_or_are_given_for_each_car():
     assert envs.reset(seed=[7, None, 9]) and envs.np_random_seed[::2] == (7, 9)
     before = [state.bit_generator.state for state in envs.np_random], envs.cars.cars.copy()
     for seeds in ([1, 2], "abc", [1, 2, "3"], [1, 2, -1], -1):
-        with pytest.raises(ValueError, match=r"expected 3 numbers 0, 1, \.\.\., or one"):
+        with pytest.raises(ValueError, match=r"expected (3 seeds|one for|a whole number)"):
             envs.reset(seed=seeds)
     assert before[0] == [state.bit_generator.state for state in envs.np_random]
     assert np.array_equal(before[1], envs.cars.cars)
@@ -130,7 +130,7 @@ def test_a_step_before_the_first_reset_is_refused(mode):
     "arguments", [{"num_envs": 0}, {"max_episode_steps": 0}, {"render_mode": "rgb_array"}]
 )
 def test_impossible_settings_are_refused(arguments):
-    with pytest.raises(ValueError, match="expected at least 1, at least 1, and None"):
+    with pytest.raises(ValueError, match=r"expected a whole number from 1|choose one of None"):
         CarRacingVector(**arguments)
 
 
@@ -147,7 +147,7 @@ def test_actions_for_more_or_fewer_cars_are_refused_also_after_an_end(continuous
     envs.reset(seed=0)
     for _ in range(2):  # driving, then about to begin anew
         for wrong in (np.zeros((CARS + 1, 3)), np.zeros(CARS - 1, int), None, "abc"):
-            with pytest.raises(ValueError, match="actions of shape"):
+            with pytest.raises(ValueError, match=r"actions( of shape|=)"):
                 envs.step(wrong)
         envs.step(envs.action_space.sample())
 
