@@ -114,9 +114,7 @@ def test_seeds_count_up_from_one_number_or_are_given_for_each_car():
     assert envs.reset(seed=[7, None, 9]) and envs.np_random_seed[::2] == (7, 9)
     before = [state.bit_generator.state for state in envs.np_random], envs.cars.cars.copy()
     for seeds in ([1, 2], "abc", [1, 2, "3"], [1, 2, -1], -1):
-        with pytest.raises(
-            ValueError, match=r"expected (3 seeds|one for|a whole number)"
-        ):
+        with pytest.raises(ValueError, match=r"expected (3 seeds|one for|a whole number)"):
             envs.reset(seed=seeds)
     assert before[0] == [state.bit_generator.state for state in envs.np_random]
     assert np.array_equal(before[1], envs.cars.cars)
