@@ -194,8 +194,8 @@ class Cars:
             actions = np.ascontiguousarray(found, np.float64)
             if actions.shape != (count, 3) or not np.isfinite(actions).all():
                 raise ValueError(
-                    f"actions {shown(actions)}: expected finite numbers of shape ({count}, 3), steering,"
-                    " gas and brake"
+                    f"actions {shown(actions)}: expected finite numbers of shape ({count}, 3),"
+                    " steering, gas and brake"
                 )
             return actions
         kinds = numbers("actions", actions, f"{count} numbers, each 0 to 4")

@@ -128,6 +128,7 @@ def check_temperature(temperature: float) -> None:
     """Raise ValueError unless float32 can divide by the temperature, and it is above 0."""
     number = isinstance(temperature, int | float | np.number) and temperature is not True
     if not number or not 1e-6 <= temperature < 1e20:
+        found = " ".join(repr(temperature).split())
         raise ValueError(
-            f"temperature={' '.join(repr(temperature).split())}: expected a finite number from 1e-6 on; 1 is as trained"
+            f"temperature={found}: expected a finite number from 1e-6 on; 1 is as trained"
         )
