@@ -105,7 +105,7 @@ def check_tracks(episodes: int, first_track: int) -> None:
     if not whole or not 1 <= episodes <= MOST_EPISODES or not low <= first_track <= high - episodes:
         raise ValueError(
             f"episodes={shown(episodes)} from first_track={shown(first_track)}: expected 1 to"
-            f" {MOST_EPISODES} episodes, on tracks {low} to {high - 1}; those above are for training"
+            f" {MOST_EPISODES} episodes, on tracks {low} to {high - 1}; others are for training"
         )
 
 
