@@ -262,7 +262,7 @@ def test_tracks_may_be_numpy_s_integers_none_is_below_zero_and_there_is_one(agen
         drive(agent, [1.5])
     with pytest.raises(ValueError, match="patience=-1: expected a whole number from 0"):
         drive(agent, [1], patience=-1)
-    with pytest.raises(ValueError, match="tracks is empty"):
+    with pytest.raises(ValueError, match=r"tracks=\[\]: expected the seed"):
         drive(agent, [])
 
 
