@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import gymnasium as gym
 import numpy as np
 
+from stad_lab.envs.arguments import car_numbers, numbers, shown, whole_number
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import FRAME_SIZE, FrameMemory, to_frame
@@ -75,7 +76,8 @@ class Agent:
             seen: observations, uint8 (cars, 96, 96, 3), or frames, uint8 (cars, 64, 64, 3), with
                 the bar cropped as V was trained. Their number changes only by `keep` or `reset`.
         """
-        self._check_count(len(seen))
+        seen = numbers("seen", seen, "an observation of each car")
+        self._check_count(len(seen) if seen.ndim == 4 else 0)
         if seen[0].shape[:2] != (FRAME_SIZE, FRAME_SIZE):
             seen = [to_frame(observation, self.world_model.crop_bar) for observation in seen]
         frames = np.asarray(seen)
@@ -112,6 +114,7 @@ class Agent:
     def keep(self, cars: np.ndarray) -> None:
         """Continue with some of the present cars, by their indices, until the next reset."""
         self._check_acted()
+        cars = car_numbers(cars, len(self.cars))
         self.memory.keep(cars)
         self.state = self.state[:, cars]
         self.latents, self.hidden = self.latents[cars], self.hidden[cars]
@@ -194,9 +197,8 @@ def rollout(
         patience: an episode ends after so many frames without a new tile; 0 for never.
         observe: called before every step with the numbers of the cars, what they see, and actions.
     """
-    for name, value, least in (("max_frames", max_frames, 1), ("patience", patience, 0)):
-        if not isinstance(value, int | np.integer) or value < least:
-            raise ValueError(f"{name}={value!r}: expected at least {least}, a whole number")
+    max_frames = whole_number("max_frames", max_frames, 1)
+    patience = whole_number("patience", patience)
     returns, rewards = np.zeros(len(batch)), [list[float]() for _ in range(len(batch))]
     last_tile = np.zeros(len(batch), int)  # the frame in which a car last reached a new tile
     driving = np.arange(len(batch))
@@ -230,12 +232,9 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
         fast: use our engine, which draws the agent's frames directly, not Gymnasium's environment.
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
     """
-    if not len(tracks):
-        raise ValueError("tracks is empty: expected the seed of at least one track")
-    for track in tracks:
-        if not isinstance(track, int | np.integer) or track < 0:
-            raise ValueError(f"track {track!r}: expected at least 0, a whole number")
-    tracks = [int(track) for track in tracks]  # NumPy's integers are refused by Gymnasium
+    if not isinstance(tracks, Sequence | np.ndarray) or not np.size(tracks):
+        raise ValueError(f"tracks={shown(tracks)}: expected the seed of at least one track")
+    tracks = [whole_number("track", track) for track in tracks]
     if fast:
         cars = Cars(len(tracks), "frame", bar=not agent.world_model.crop_bar)
         cars.reset(tracks)
@@ -254,7 +253,9 @@ def shipped_agents() -> list[str]:
 def run_folder(source: str | Path) -> Path:
     """The folder of an agent: that of a shipped one by its name, or the folder of a run."""
     if not isinstance(source, str | Path):
-        raise ValueError(f"agent {source!r}: expected a shipped agent's name or a run's folder")
+        raise ValueError(
+            f"agent {shown(source)}: expected a shipped agent's name or a run's folder"
+        )
     shipped = {folder.name for folder in PRETRAINED.iterdir()}
     return PRETRAINED / source if source in shipped else Path(source)
 

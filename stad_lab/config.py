@@ -174,9 +174,11 @@ class Config:
                 and takes "laptop" if that is not set.
             **changes: as for `replace`.
         """
-        name = name or os.environ.get(PRESET_VARIABLE) or "laptop"
-        if name not in PRESETS:
-            raise ValueError(f"unknown preset {name!r}: choose one of {', '.join(PRESETS)}")
+        if name is None:
+            name = os.environ.get(PRESET_VARIABLE) or "laptop"
+        if not isinstance(name, str) or name not in PRESETS:
+            found = " ".join(repr(name).split())
+            raise ValueError(f"unknown preset {found}: choose one of {', '.join(PRESETS)}")
         return PRESETS[name].replace(**changes)
 
     def replace(self, **changes) -> "Config":
@@ -196,6 +198,8 @@ class Config:
 def with_values(base: Any, values: dict) -> Any:
     """A copy of the dataclass `base` with the values of a nested dict."""
     known, changed = [one.name for one in dataclasses.fields(base)], {}
+    if not isinstance(values, dict):
+        raise ValueError(f"settings of type {type(values).__name__}: expected a dict")
     for name, value in values.items():
         if name not in known:
             raise ValueError(f"unknown setting {name!r}: expected one of {', '.join(known)}")
@@ -222,12 +226,13 @@ def fields_of(config: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
 
 def check_value(name: str, kind: Any, value: Any) -> None:
     """Raise ValueError unless `value` is a valid value of the field `name`."""
+    shown = " ".join(repr(value).split())  # an array has several lines
     if choices := typing.get_args(kind):
-        if value not in choices:
-            raise ValueError(f"{name}={value!r}: choose one of {', '.join(map(repr, choices))}")
+        if not isinstance(value, str) or value not in choices:
+            raise ValueError(f"{name}={shown}: choose one of {', '.join(map(repr, choices))}")
         return
     if type(value) is not kind and not (kind is float and type(value) is int):
-        raise ValueError(f"{name}={value!r} is a {type(value).__name__}: expected {kind.__name__}")
+        raise ValueError(f"{name}={shown} is a {type(value).__name__}: expected {kind.__name__}")
     if kind in (int, float):
         low, high = RANGES.get(name, (1 if kind is int else SMALLEST_SIGMA, 1e12))
         if not low <= value <= high:

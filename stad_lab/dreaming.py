@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from stad_lab.agent import Agent, EnvBatch, rollout, run_folder
+from stad_lab.envs.arguments import whole_number
 from stad_lab.envs.dream import DreamEnv
 from stad_lab.envs.dreams import DreamVector
 from stad_lab.io.weights import load_world_model
@@ -57,6 +58,7 @@ def dream_on(
     Returns:
         The dreamed frames, uint8 (frames, 64, 64, 3), and the actions, float32 (frames, 3).
     """
+    seed = whole_number("seed", seed, 0, 2**63 - 1)
     state = to_state(agent.state)
     if state is None:
         raise ValueError("the agent has not acted yet: let it drive some real frames first")

@@ -256,18 +256,18 @@ def test_a_first_step_that_is_refused_leaves_the_number_of_cars_open(agent, obse
 def test_tracks_may_be_numpy_s_integers_none_is_below_zero_and_there_is_one(agent):
     found = [drive(agent, tracks, max_frames=3).returns for tracks in ([1, 2], np.array([1, 2]))]
     assert np.array_equal(*found)
-    with pytest.raises(ValueError, match="track -1: expected at least 0"):
+    with pytest.raises(ValueError, match="track=-1: expected a whole number from 0"):
         drive(agent, [3, -1])
-    with pytest.raises(ValueError, match=r"track 1\.5: expected at least 0, a whole number"):
+    with pytest.raises(ValueError, match=r"track=1\.5: expected a whole number from 0"):
         drive(agent, [1.5])
-    with pytest.raises(ValueError, match="patience=-1: expected at least 0"):
+    with pytest.raises(ValueError, match="patience=-1: expected a whole number from 0"):
         drive(agent, [1], patience=-1)
-    with pytest.raises(ValueError, match="tracks is empty"):
+    with pytest.raises(ValueError, match=r"tracks=\[\]: expected the seed"):
         drive(agent, [])
 
 
 def test_an_episode_without_a_frame_is_refused(agent):
-    with pytest.raises(ValueError, match="max_frames=0: expected at least 1"):
+    with pytest.raises(ValueError, match="max_frames=0: expected a whole number from 1"):
         rollout(agent, Cars(1), max_frames=0)
 
 

@@ -250,9 +250,9 @@ def test_a_film_is_a_moving_picture(quick_run, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--track", "-1"], "track -1: expected at least 0|track=-1: expected at least 0"),
-        (["--first", "-6"], "first=-6: expected at least 0"),
-        (["--frames", "0"], "frames=0: expected at least 1"),
+        (["--track", "-1"], "track=-1: expected"),
+        (["--first", "-6"], "first=-6: expected"),
+        (["--frames", "0"], "frames=0: expected"),
         (["--out", "film.webp"], r"film.webp: expected a .gif"),
         (["--out", ""], "--out is empty"),
     ],

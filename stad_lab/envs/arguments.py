@@ -79,11 +79,13 @@ def check_options(options: Any) -> dict:
 
 
 def car_numbers(which: Any, count: int) -> np.ndarray:
-    """Numbers of cars as int64 (n,); all for None. ValueError for a car that is not there."""
+    """Numbers of cars, or a mask of them, as int64 (n,); all for None. ValueError for others."""
     expected = f"numbers of cars, each once, from 0 to {count - 1}"
     if which is None:
         return np.arange(count)
     found = numbers("which", which, expected)
+    if found.dtype == bool and found.shape == (count,):  # a mask
+        return np.flatnonzero(found)
     fits = found.ndim == 1 and (found.dtype.kind in "iu" or not len(found))
     values = found.tolist() if fits else []
     if not fits or not set(range(count)).issuperset(values) or len(set(values)) < len(values):

@@ -53,9 +53,8 @@ def make_env(fast: bool = True, **kwargs) -> gym.Env:
     rules = ("continuous", "lap_complete_percent", "domain_randomize", "bar")
     check_rules(**{name: kwargs[name] for name in rules if name in kwargs})
     choice("render_mode", kwargs.get("render_mode"), (None, *RENDER_MODES))
-    if kwargs.get("max_episode_steps") not in (None, -1):  # Gymnasium's: the usual, and no limit
-        steps = whole_number("max_episode_steps", kwargs["max_episode_steps"], 1)
-        kwargs["max_episode_steps"] = steps
+    if (steps := kwargs.get("max_episode_steps")) is not None:  # -1 is no limit, for Gymnasium
+        kwargs["max_episode_steps"] = whole_number("max_episode_steps", steps, -1)
     return gym.make(FAST_ID if fast else "CarRacing-v3", **kwargs)
 
 

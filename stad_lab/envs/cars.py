@@ -194,13 +194,13 @@ class Cars:
             actions = np.ascontiguousarray(found, np.float64)
             if actions.shape != (count, 3) or not np.isfinite(actions).all():
                 raise ValueError(
-                    f"actions {actions}: expected finite numbers of shape ({count}, 3), steering,"
-                    " gas and brake"
+                    f"actions {shown(actions)}: expected finite numbers of shape ({count}, 3),"
+                    " steering, gas and brake"
                 )
             return actions
         kinds = numbers("actions", actions, f"{count} numbers, each 0 to 4")
         if kinds.shape != (count,) or not np.isin(kinds, range(len(DISCRETE_ACTIONS))).all():
-            raise ValueError(f"actions {kinds}: expected {count} numbers, each 0 to 4")
+            raise ValueError(f"actions {shown(kinds)}: expected {count} numbers, each 0 to 4")
         return DISCRETE_ACTIONS[kinds.astype(np.int64)]
 
     def _paint(self, car: int) -> None:
@@ -229,10 +229,10 @@ def check_rules(
     switches = {"continuous": continuous, "domain_randomize": domain_randomize, "bar": bar}
     for name, value in switches.items():
         if not isinstance(value, bool | np.bool_):
-            raise ValueError(f"{name}={value!r}: expected True or False")
+            raise ValueError(f"{name}={shown(value)}: expected True or False")
     number = isinstance(lap_complete_percent, int | float | np.number)
     if not number or not 0 <= lap_complete_percent <= 1:
-        raise ValueError(f"lap_complete_percent={lap_complete_percent!r}: expected 0 to 1")
+        raise ValueError(f"lap_complete_percent={shown(lap_complete_percent)}: expected 0 to 1")
 
 
 def seeds_of(seed: int | Sequence[int | None] | None, count: int) -> list[int | None]:
@@ -247,7 +247,9 @@ def check_seeds(seeds: Any, count: int) -> list[int | None]:
     """A seed for each of `count` cars, or None. ValueError for another number or kind of them."""
     if seeds is None:
         return [None] * count
-    if not isinstance(seeds, Sequence | np.ndarray) or isinstance(seeds, str | bytes):
+    if isinstance(seeds, np.ndarray) and seeds.ndim:
+        seeds = list(seeds)
+    if not isinstance(seeds, Sequence) or isinstance(seeds, str | bytes):
         raise ValueError(f"seeds={shown(seeds)}: expected {count} seeds, one for each car")
     if len(seeds) != count:
         raise ValueError(f"{len(seeds)} seeds for {count} cars: expected one for each")

@@ -18,7 +18,7 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from stad_lab.envs.arguments import check_options, numbers, whole_number
+from stad_lab.envs.arguments import check_options, numbers, shown, whole_number
 from stad_lab.envs.cars import MOST_CARS, seeds_of
 from stad_lab.envs.dream import DreamEnv
 from stad_lab.envs.vector import check_autoreset
@@ -75,7 +75,9 @@ class DreamVector(gym.vector.VectorEnv):
         self._check_open()
         mask = np.asarray(check_options(options).get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not (self._begun or mask.all()):
-            raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), at first all")
+            raise ValueError(
+                f"reset_mask={shown(mask)}: expected bool ({self.num_envs},), at first all"
+            )
         seeds = seeds_of(seed, self.num_envs)
         for number in np.flatnonzero(mask).tolist():
             self.dreams[number].reset(seed=seeds[number])

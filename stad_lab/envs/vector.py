@@ -17,9 +17,9 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from stad_lab.envs import physics
-from stad_lab.envs.arguments import check_options, choice, numbers, whole_number
+from stad_lab.envs.arguments import check_options, choice, numbers, shown, whole_number
 from stad_lab.envs.car_racing import MAX_FRAMES, action_space, check_skip
-from stad_lab.envs.cars import MOST_CARS, Cars, seeds_of
+from stad_lab.envs.cars import MOST_CARS, Cars, check_rules, seeds_of
 from stad_lab.envs.frames import OBSERVATION_SIZE
 from stad_lab.envs.own_track import Checkpoints
 from stad_lab.envs.views import View
@@ -73,6 +73,7 @@ class CarRacingVector(gym.vector.VectorEnv):
         self.autoreset_mode = check_autoreset(autoreset_mode)
         self.metadata = {"autoreset_mode": self.autoreset_mode, "render_modes": []}
         rules = (continuous, lap_complete_percent, domain_randomize)
+        check_rules(*rules, bar)
         self.view, self.frame_skip = View(observes, size, bar), check_skip(frame_skip)
         self.single_observation_space = self.view.space
         self.single_action_space = action_space(continuous)
@@ -99,9 +100,13 @@ class CarRacingVector(gym.vector.VectorEnv):
         options = check_options(options)
         mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
         if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(f"reset_mask={mask}: expected bool ({self.num_envs},), one at least")
+            raise ValueError(
+                f"reset_mask={shown(mask)}: expected bool ({self.num_envs},), one at least"
+            )
         if not self._begun and not mask.all():
-            raise ValueError(f"reset_mask={mask}: the first reset is of all cars, leave it out")
+            raise ValueError(
+                f"reset_mask={shown(mask)}: the first reset is of all cars, leave it out"
+            )
         whole = seeds_of(seed, self.num_envs)
         which = np.flatnonzero(mask)
         seeds = [one for one, asked in zip(whole, mask, strict=True) if asked]

@@ -14,6 +14,7 @@ from tqdm.auto import tqdm
 
 from stad_lab.agent import Agent, load_agent, run_folder
 from stad_lab.config import REPORTED_TRACKS, TRACK_RANGES
+from stad_lab.envs.arguments import is_whole, shown
 from stad_lab.evaluation.statistics import SOLVED, summarise
 from stad_lab.io.files import (
     check_writable,
@@ -100,10 +101,11 @@ def evaluate(
 def check_tracks(episodes: int, first_track: int) -> None:
     """Raise ValueError unless these tracks are in the range for tests."""
     low, high = TRACK_RANGES["test"]
-    if not 1 <= episodes <= MOST_EPISODES or not low <= first_track <= high - episodes:
+    whole = is_whole(episodes) and is_whole(first_track)
+    if not whole or not 1 <= episodes <= MOST_EPISODES or not low <= first_track <= high - episodes:
         raise ValueError(
-            f"episodes={episodes} from first_track={first_track}: expected 1 to {MOST_EPISODES}"
-            f" episodes, on tracks {low} to {high - 1}; those above are for training"
+            f"episodes={shown(episodes)} from first_track={shown(first_track)}: expected 1 to"
+            f" {MOST_EPISODES} episodes, on tracks {low} to {high - 1}; others are for training"
         )
 
 

@@ -127,7 +127,8 @@ def to_state(memory: np.ndarray | None) -> State | None:
 def check_temperature(temperature: float) -> None:
     """Raise ValueError unless float32 can divide by the temperature, and it is above 0."""
     number = isinstance(temperature, int | float | np.number) and temperature is not True
-    if not number or not 1e-6 <= temperature < 1e30:
+    if not number or not 1e-6 <= temperature < 1e20:
+        found = " ".join(repr(temperature).split())
         raise ValueError(
-            f"temperature={temperature!r}: expected a finite number from 1e-6 on; 1 is as trained"
+            f"temperature={found}: expected a finite number from 1e-6 on; 1 is as trained"
         )
