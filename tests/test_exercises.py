@@ -262,6 +262,20 @@ def test_exercises_are_committed_clean(path):
         assert "SOLUTION" not in text and "Model answer" not in text
 
 
+# Not yet short: the exercises of notebook 02.
+SHORT = [path for path in NOTEBOOKS if path.stem[:2] != "02"]
+
+
+@pytest.mark.parametrize("path", SHORT, ids=lambda path: f"{path.parent.name}/{path.stem}")
+def test_a_cell_has_at_most_12_lines_of_88_columns_and_a_model_answer_may_be_taller(path):
+    tall, wide = 12, 88
+    code = [cell for cell in read_cells(path) if cell["cell_type"] == "code"]
+    lines = {cell["id"]: cell["source"].splitlines() for cell in code}
+    answers = {cell["id"] for cell in code if grading(cell)["solution"] and path.parent != COURSE}
+    assert [name for name, own in lines.items() if max(map(len, own)) > wide] == []
+    assert {name for name, own in lines.items() if len(own) > tall} <= answers
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_points_in_the_table_are_those_that_nbgrader_gives(name):
     cells = read_cells(SOURCES[name])
@@ -297,7 +311,9 @@ def moments():
             for cell in read_cells(SOURCES[name]):
                 cell_grading = grading(cell)
                 needed = cell_grading["grade_id"] or re.search(
-                    r"^(def|import|from|sys\.stderr|quick)\b", cell["source"], re.MULTILINE
+                    r"^(def|import|from|sys\.stderr|quick|awake)\b",
+                    cell["source"],
+                    re.MULTILINE,
                 )
                 if (
                     cell["cell_type"] != "code"

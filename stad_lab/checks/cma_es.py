@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stad_lab.checks.answers import WrongAnswer, ask, check, check_interval
+from stad_lab.checks.answers import WrongAnswer, ask, check, check_interval, to_numpy
 
 
 def right_weights(size: int) -> np.ndarray:
@@ -19,7 +19,9 @@ def weights_of_ranks(weights: Callable) -> None:
         what, half = f"weights({size})", size // 2
         right, ranks = right_weights(size), np.arange(1, size // 2 + 1)
         found = ask(what, weights, size)
-        if np.shape(found) == (half,) and not np.isfinite(found).all():
+        array = to_numpy(found)
+        real = array.shape == (half,) and array.dtype.kind == "f"
+        if real and not np.isfinite(array).all():
             remedy = "ranks count from 1, np.arange(1, mu + 1)"
             raise WrongAnswer(what, "ln 0 is minus infinity", remedy)
         raw = np.log((size + 1) / 2) - np.log(ranks)

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stad_lab.checks.answers import WrongAnswer, agree, ask, check, check_interval
+from stad_lab.checks.answers import WrongAnswer, agree, ask, check, check_interval, to_numpy
 from stad_lab.envs.frames import earlier_index, episode_differences
 
 
@@ -48,10 +48,20 @@ def check_differences(differences: Callable, film: np.ndarray, stride: int) -> n
     what = f"differences(film, {stride})"
     found = ask(what, differences, film, stride)
     later = slice(stride, None)  # a mistake there is named, whatever the first frames are
-    if np.shape(found) == right.shape and not agree(np.asarray(found)[later], right[later], 1e-4):
+    array = to_numpy(found)
+    if array.shape == right.shape and not agree(array[later], right[later], 1e-4):
         late = {hint: one[later] for hint, one in mistakes.items() if one.shape == right.shape}
-        check(f"{what}[{stride}:]", np.asarray(found)[later], right[later], late)
+        check(f"{what}[{stride}:]", array[later], right[later], late)
     check(what, found, right, mistakes)
+    return found
+
+
+def ask_motion(what: str, find_motion: Callable, *given: np.ndarray) -> np.ndarray:
+    """The student's (turn, forward), an array (2,); WrongAnswer if they are not two numbers."""
+    answer = ask(what, find_motion, *given)
+    found = to_numpy(answer)
+    if found.shape != (2,) or found.dtype.kind not in "iuf":
+        raise WrongAnswer(what, f"it returned {answer!r}", "expected two numbers, (turn, forward)")
     return found
 
 
@@ -84,11 +94,9 @@ def find_motion_made_up(find_motion: Callable, move: Callable, earlier: np.ndarr
         ),
     }
     what = "find_motion of a picture moved by 0.1 and 3"
-    answer = ask(what, find_motion, moved, earlier, turns, forwards)
-    if np.shape(answer) != (2,):
-        raise WrongAnswer(what, f"it returned {answer!r}", "expected two numbers, (turn, forward)")
+    found = ask_motion(what, find_motion, moved, earlier, turns, forwards)
     mistakes = {hint: np.array(pair) for hint, pair in pairs.items()}
-    check(what, np.array(answer), np.array([turns[6], forwards[7]]), mistakes)
+    check(what, found, np.array([turns[6], forwards[7]]), mistakes)
 
 
 def find_motion_real(find_motion: Callable, ride: Callable) -> None:
@@ -103,7 +111,7 @@ def find_motion_real(find_motion: Callable, ride: Callable) -> None:
     for steering in (-0.8, 0.0, 0.6):
         frame, earlier, (speed, yaw) = ride(steering)
         what = f"find_motion with steering {steering}"
-        found = np.array(ask(what, find_motion, frame, earlier, turns, forwards)) / 0.08
+        found = ask_motion(what, find_motion, frame, earlier, turns, forwards) / 0.08
         print(f"{steering:8.1f} {found[0]:16.2f} {yaw:6.2f} {found[1]:13.1f} {speed:6.1f}")
         hint = "convert to float before you subtract, and leave out the rows from 48 on"
         if not abs(found[0] - yaw) < 0.5:
