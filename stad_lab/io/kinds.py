@@ -27,7 +27,10 @@ HISTORY = [{"step": int, "train": dict, "heldout": dict}]
 EPISODE = {"index": int, "track": int, "frames": int, "frames_sha256": str, "actions_sha256": str}
 
 SHAPES: dict[str, Any] = {
-    "dataset": {"episodes": [EPISODE], "made_with?": SETTINGS},
+    "dataset": {
+        "episodes": [EPISODE],
+        "made_with": {"data": {"episodes": int, "agent_episodes?": int}},
+    },
     "evolution": {
         "variant": str,
         "seed": int,
