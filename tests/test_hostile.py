@@ -269,7 +269,7 @@ json_values = st.recursive(
 
 
 @settings(
-    max_examples=30, deadline=None, derandomize=True, database=None, suppress_health_check=QUIET
+    max_examples=10, deadline=None, derandomize=True, database=None, suppress_health_check=QUIET
 )
 @given(name=st.sampled_from(sorted(READERS)), data=st.data())
 def test_a_file_with_a_hostile_content_and_a_right_checksum_is_refused_in_one_line(name, data, run):
