@@ -1,35 +1,20 @@
 """The leaderboard: one HTML file, with films of the best and the worst lap of the first ten."""
 
-import base64
 import html
 
 import pandas as pd
 from PIL import Image
 
 from stad_lab.compete.drive import replay
+from stad_lab.viz.page import document, picture
 from stad_lab.viz.video import enlarged, save_pages
 
 FILMED, EVERY, SIZE = 10, 8, 192  # submissions; frames; pixels
 STYLE = """
-:root{color-scheme:light dark;--page:#fbfbf9;--ink:#1c2321;--soft:#5c6663;--line:#d9dedb;
---bar:#0072b2;--card:#fff;--bad:#a33b00}
-@media(prefers-color-scheme:dark){:root{--page:#14181a;--ink:#e8ecea;--soft:#a0aaa6;--line:#333b3d;
---bar:#56b4e9;--card:#1c2224;--bad:#ff9d66}}
-*{box-sizing:border-box}body{margin:0;background:var(--page);color:var(--ink);
-font:16px/1.5 system-ui,sans-serif}main{max-width:62rem;margin:auto;padding:2rem 1rem}
-h1{font-size:1.9rem;line-height:1.2;margin:0 0 .5rem}p{max-width:44rem}.soft{color:var(--soft)}
-code{overflow-wrap:anywhere;font-size:.85em}.table{overflow-x:auto;border:1px solid var(--line);
-border-radius:.6rem;background:var(--card)}table{border-collapse:collapse;width:100%}
-th,td{padding:.45rem .7rem;text-align:right;border-bottom:1px solid var(--line);
-font-variant-numeric:tabular-nums;white-space:nowrap}tr:last-child td{border:0}
-th{font-weight:600;color:var(--soft);font-size:.85rem}td:nth-child(2),th:nth-child(2){text-align:left}
-.baseline{font-style:italic}svg{display:block;width:9rem;height:1rem}
-details{border:1px solid var(--line);border-radius:.6rem;background:var(--card);margin:.5rem 0;
-padding:.6rem .9rem}summary{cursor:pointer;font-weight:600}.films{display:flex;gap:1rem;
-flex-wrap:wrap}figure{margin:.7rem 0 0}img{display:block;width:12rem;image-rendering:pixelated;
-border-radius:.4rem}figcaption{font-size:.9rem;color:var(--soft)}li{margin:.3rem 0}
-.bad{color:var(--bad)}@media(max-width:40rem){.wide{display:none}th,td{padding:.4rem .45rem}
-svg{width:5rem}main{padding:1.2rem .8rem}}
+td:nth-child(2),th:nth-child(2){text-align:left}.baseline{font-style:italic}
+svg{display:block;width:9rem;height:1rem}.films{display:flex;gap:1rem;flex-wrap:wrap}
+img{display:block;width:12rem;image-rendering:pixelated;border-radius:.4rem}
+@media(max-width:40rem){svg{width:5rem}}
 """
 
 
@@ -55,16 +40,14 @@ def leaderboard(table: pd.DataFrame, tracks: list[int], commitment: str, facts: 
         f"<th{' class=wide' * (number in (3, 5, 6))} scope=col>{text}</th>"
         for number, text in enumerate(headings)
     )
-    return f"""<!doctype html><html lang="en"><meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1"><title>Leaderboard</title>
-<style>{STYLE}</style><main><h1>{html.escape(table["name"][0])} leads</h1>
-<p class=soft>{len(table)} agents on {len(tracks)} hidden tracks. A place with = is not
-significantly behind the first (paired t-test over tracks, Holm, p &ge; 0.05). Baselines are in
-italics.</p><div class=table tabindex=0 role=region aria-label="Ranking"><table>
+    body = f"""<p class=soft>{len(table)} agents on {len(tracks)} hidden tracks. A place with =
+is not significantly behind the first (paired t-test over tracks, Holm, p &ge; 0.05). Baselines are
+in italics.</p><div class=table tabindex=0 role=region aria-label="Ranking"><table>
 <thead><tr>{cells}</tr></thead><tbody>{rows}</tbody></table></div>
 <h2>Best and worst lap of the first {min(FILMED, len(table))}</h2>{films}
 {"<h2>What went wrong</h2><ul>" + errors + "</ul>" if errors else ""}
-<h2>The tracks</h2>{about_tracks(commitment, facts)}</main></html>"""
+<h2>The tracks</h2>{about_tracks(commitment, facts)}"""
+    return document(f"{table['name'][0]} leads", body, STYLE)
 
 
 def row_of(one) -> str:
@@ -95,9 +78,8 @@ def films_of(one, tracks: list[int]) -> str:
     for number, kind in zip(laps, kinds, strict=False):  # a submission may have no lap
         film = to_film(replay(tracks[int(number)], one.laps[number], EVERY))
         text = f"{kind} lap: {one.returns[int(number)]:.0f} points, track {int(number) + 1}"
-        source = f"data:image/webp;base64,{base64.b64encode(film).decode()}"
-        figures += f'<figure><img loading=lazy alt="Film of the {text}" src="{source}">'
-        figures += f"<figcaption>{text}</figcaption></figure>"
+        shown = picture(film, "webp", f"Film of the {text}")
+        figures += f"<figure>{shown}<figcaption>{text}</figcaption></figure>"
     if not figures:
         return ""
     name = html.escape(one.name)
