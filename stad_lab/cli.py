@@ -177,6 +177,7 @@ def training_command(config: Config) -> Callable:
         earlier: str | None = None,
         until: Literal["dataset", "vae", "mdn_rnn", "controller"] = "controller",
         scheduler: str | None = None,
+        tensorboard: bool = False,
     ) -> None:
         """Collect a dataset, train V, train M, evolve C: `train [quick|laptop|paper] --out RUN`.
 
@@ -190,13 +191,20 @@ def training_command(config: Config) -> Callable:
             earlier: For a second iteration: the run whose agent drives and whose C is carried over.
             until: The last stage to run.
             scheduler: Address of a Dask scheduler, to drive on a cluster.
+            tensorboard: Write losses, returns, latents and a film to OUT/tensorboard as well.
         """
         from stad_lab.training.pipeline import train
 
-        folder = output(out)
+        folder, board = output(out), None
+        if tensorboard:
+            from stad_lab.viz.tensorboard import TensorBoard
+
+            board = TensorBoard(folder / "tensorboard")
         with cluster_of(scheduler) as executor:
-            if not train(config, folder, dataset, until, executor, earlier):
+            if not train(config, folder, dataset, until, executor, earlier, board):
                 print(f"everything up to {until} is there in {folder}: nothing to do")
+        if board:
+            board.add_agent(folder)
 
     return train
 
@@ -492,6 +500,27 @@ def ship(run: str, name: str) -> None:
     print(f"shipped to {ship(run, name)}")
 
 
+def report(run: str, out: Path | None = None) -> None:
+    """Write a page about a run, finished or not: scores, film, curves, and what made it.
+
+    Args:
+        run: A shipped agent, or the folder of a run.
+        out: The .html to write; by default report.html in the run, or here for a shipped agent.
+    """
+    from stad_lab.agent import PRETRAINED, run_folder
+    from stad_lab.io.files import check_writable, write_bytes
+    from stad_lab.viz.report import report
+
+    folder = run_folder(run)
+    shipped = folder.parent == PRETRAINED
+    file = out or (Path(f"report-{folder.name}.html") if shipped else folder / "report.html")
+    if file.suffix.lower() != ".html":
+        raise ValueError(f"--out {file}: expected a .html")
+    check_writable(file)
+    write_bytes(file, report(folder).encode())
+    print(f"written to {file}")
+
+
 def film(agent: str, out: str, track: int = 5, first: int = 60, frames: int = 240) -> None:
     """Make a film of an agent driving: observation, difference image, reconstruction and dream.
 
@@ -580,6 +609,7 @@ COMMANDS: dict[str, Callable] = {
     "latents": latents,
     "benchmark": benchmark,
     "ship": ship,
+    "report": report,
     "film": film,
     "compete": compete,
 }

@@ -25,7 +25,7 @@ EXTRAS = {  # without the extras that an extra includes
 }
 GROUPS = PYPROJECT["dependency-groups"]
 MOST = 4  # packages that the engine may need
-LISTED = ("train", "lab", "course", "cluster")  # extras that environment.txt brings
+LISTED = ("train", "lab", "course", "cluster", "tensorboard")  # extras that environment.txt brings
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
@@ -70,7 +70,7 @@ def test_the_engine_needs_little_and_nothing_of_training_tests_pages_courses_or_
     assert len(core) <= MOST
     others = [one for part in (EXTRAS, GROUPS) for some in part.values() for one in some]
     assert not core.keys() & by_name(others).keys()
-    assert set(EXTRAS) == {"train", "lab", "course", "cluster", "benchmark"}
+    assert set(EXTRAS) == {"train", "lab", "course", "cluster", "tensorboard", "benchmark"}
     assert set(GROUPS) == {"test", "docs", "lint"}
 
 

@@ -33,16 +33,23 @@ class Latents:
     vae: str  # checksum of the V that encoded them
 
 
-def train_mdn_rnn(config: Config, dataset: Callable[[], Dataset], folder: Path) -> bool:
+def train_mdn_rnn(
+    config: Config,
+    dataset: Callable[[], Dataset],
+    folder: Path,
+    watch: Callable[[list[dict]], None] | None = None,
+) -> bool:
     """Train M on the dataset as V, in `folder`, encodes it; False if M was there already.
 
-    An interrupted training continues. `dataset` opens the dataset. Raises as `train_vae`.
+    An interrupted training continues. Arguments and errors are those of `train_vae`.
     """
     path = Path(folder) / MDN_RNN_FILE
     if path.exists():
         check_vae(config, None, folder)
         check_mdn_rnn(config, folder)
         path.with_name(CHECKPOINT).unlink(missing_ok=True)  # of a process that was killed
+        if watch:
+            watch(weights.load_mdn_rnn(path)[1]["history"])
         return False
     data = dataset()
     check_vae(config, data.checksum, folder)
@@ -54,7 +61,7 @@ def train_mdn_rnn(config: Config, dataset: Callable[[], Dataset], folder: Path) 
         if config.mdn_rnn.steps:
             encoded = encode_dataset(vae.to(device), data, config.vae.stride)
         latents = Latents(encoded, data.actions, data.first_heldout, metadata["weights"])
-        fit_mdn_rnn(config, latents, path, device)
+        fit_mdn_rnn(config, latents, path, device, watch)
     return True
 
 
@@ -71,10 +78,17 @@ def mdn_rnn_depends_on(config: Config) -> dict:
     return {"seed": config.seed, "mdn_rnn": dataclasses.asdict(config.mdn_rnn)}
 
 
-def fit_mdn_rnn(config: Config, latents: Latents, path: Path, device: torch.device) -> None:
+def fit_mdn_rnn(
+    config: Config,
+    latents: Latents,
+    path: Path,
+    device: torch.device,
+    watch: Callable[[list[dict]], None] | None = None,
+) -> None:
     """Train an M on encoded episodes and write it to `path`."""
     mdn_rnn = MDNRNN.of(config).to(device)
     training = mdn_rnn_training(config, latents, mdn_rnn, path.with_name(CHECKPOINT))
+    training.watch = watch
     history = fit(training)
     weights.save_mdn_rnn(path, mdn_rnn, config, history, latents.vae)
     training.checkpoint.unlink(missing_ok=True)

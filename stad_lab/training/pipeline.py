@@ -58,6 +58,8 @@ RUN_FILES = (*WEIGHTS, LOG, RECORD, MANIFEST)
 
 Stage = Callable[[Executor], bool]
 """Does what is missing; returns False if nothing was."""
+Watch = Callable[[str, list[dict]], None]
+"""Called with a stage's name and its history, or the generations of CMA-ES."""
 
 
 def train(
@@ -67,6 +69,7 @@ def train(
     until: str = "controller",
     executor: Executor | None = None,
     earlier: str | Path | None = None,
+    watch: Watch | None = None,
 ) -> bool:
     """Run every stage up to `until` that is not finished in `folder`; False if all were.
 
@@ -79,6 +82,7 @@ def train(
         executor: who drives; None for `config.processes` threads of this machine.
         earlier: in a second iteration, the folder of the run whose agent drives
             `data.agent_episodes` for the dataset, and whose C is carried over.
+        watch: told what the stages "vae", "mdn_rnn" and "controller" have logged, as it grows.
 
     Raises:
         ValueError: a wrong argument, or a file in the folder that is damaged or of another run.
@@ -100,13 +104,16 @@ def train(
         before = read_finished(earlier)
         second_iteration.check_earlier_agent(config, earlier)
     check_stages(config, folder, data)
-    stages = make_stages(config, folder, data, earlier)
+    stages = make_stages(config, folder, data, earlier, watch)
     wanted = {name: stages[name] for name in STAGES[: STAGES.index(until) + 1]}
     return run_stages(wanted, config, folder, data, executor, before)
 
 
-def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) -> dict[str, Stage]:
+def make_stages(
+    config: Config, folder: Path, data: Path, earlier: Path | None, watch: Watch | None = None
+) -> dict[str, Stage]:
     """The four stages as functions of the executor that drives."""
+    watched = {name: watch and functools.partial(watch, name) for name in STAGES[1:]}
     dataset = functools.cache(lambda: Dataset(data))  # read and checked once for all stages
 
     def collect_stage(pool: Executor) -> bool:
@@ -117,12 +124,12 @@ def make_stages(config: Config, folder: Path, data: Path, earlier: Path | None) 
     def controller_stage(pool: Executor) -> bool:
         did = earlier is not None and second_iteration.carry_over(config, earlier, dataset, folder)
         did |= find_components(config, dataset, folder)
-        return did | evolve(config, folder, pool)
+        return did | evolve(config, folder, pool, watched["controller"])
 
     return {
         "dataset": collect_stage,
-        "vae": lambda _: train_vae(config, dataset, folder),
-        "mdn_rnn": lambda _: train_mdn_rnn(config, dataset, folder),
+        "vae": lambda _: train_vae(config, dataset, folder, watched["vae"]),
+        "mdn_rnn": lambda _: train_mdn_rnn(config, dataset, folder, watched["mdn_rnn"]),
         "controller": controller_stage,
     }
 

@@ -1,0 +1,96 @@
+"""A run in TensorBoard, while it goes on: losses, returns, step size, latents and films."""
+
+import shutil
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from stad_lab.agent import load_agent
+from stad_lab.evaluation.trajectories import (
+    MOTION,
+    Trajectory,
+    encode_trajectory,
+    record_trajectory,
+)
+from stad_lab.io.weights import CONTROLLER_FILE, VAE_FILE, load_vae
+from stad_lab.training.evolution import fitness_curves
+from stad_lab.viz.video import film_agent
+
+TRACK, FRAMES = 5, 400  # of the episode whose latents and film are shown
+FILM = {"track": TRACK, "first": 60, "frames": 150}
+
+
+class TensorBoard:
+    """Writes what `train` tells it to `folder`, whose earlier events are replaced.
+
+    A resumed run tells its history from the start, so the curves are whole. ImportError, with the
+    remedy, if TensorBoard is not installed; ValueError if the folder holds something else.
+    """
+
+    def __init__(self, folder: Path):
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError as error:
+            remedy = "--tensorboard needs it: pip install 'stad_lab[tensorboard]'"
+            raise ImportError(f"TensorBoard is not installed; {remedy}") from error
+        if folder.exists():
+            if any(folder.iterdir()) and not any(folder.glob("events.out.tfevents.*")):
+                raise ValueError(f"{folder}: not of TensorBoard, and would be replaced: move it")
+            shutil.rmtree(folder)
+        self.writer, self.written = SummaryWriter(str(folder)), Counter[str]()
+
+    def __call__(self, stage: str, entries: list[dict]) -> None:
+        """Add what is new in a stage's history, or in the generations of CMA-ES."""
+        for entry in entries[self.written[stage] :]:
+            number = entry["generation" if stage == "controller" else "step"]
+            values = returns_of(entry) if stage == "controller" else losses_of(entry)
+            for name, value in values.items():
+                self.writer.add_scalar(f"{stage}/{name}", value, number)
+        self.written[stage] = len(entries)
+        self.writer.flush()
+
+    def add_agent(self, folder: Path) -> None:
+        """Add the film of a run's agent and the latents of its episode, if there is an agent."""
+        if (folder / CONTROLLER_FILE).exists():
+            agent = load_agent(str(folder))
+            self.add_film("agent", film_agent(agent, **FILM))
+            self.add_latents(folder, record_trajectory(agent, TRACK, FRAMES))
+        self.writer.close()
+
+    def add_film(self, name: str, gif: bytes) -> None:
+        """Add an animated GIF, which TensorBoard shows under *Images*."""
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        image = Summary.Image(encoded_image_string=gif, colorspace=3)
+        summary = Summary(value=[Summary.Value(tag=name, image=image)])
+        self.writer._get_file_writer().add_summary(summary)  # add_video would need moviepy
+
+    def add_latents(self, folder: Path, trajectory: Trajectory) -> None:
+        """Add z of each frame, with the frame and the car's motion, to the *Projector*."""
+        vae, metadata = load_vae(folder / VAE_FILE)
+        mu, _ = encode_trajectory(vae, trajectory, metadata["vae"]["stride"], metadata["crop_bar"])
+        frames = torch.from_numpy(trajectory.frames(metadata["crop_bar"]))
+        pictures = frames.permute(0, 3, 1, 2).float() / 255
+        motion = [[f"{value:.2f}" for value in row] for row in trajectory.motion]
+        names = list(MOTION)
+        self.writer.add_embedding(mu, motion, pictures, metadata_header=names, tag="z")
+
+
+def losses_of(entry: dict) -> dict[str, float]:
+    """The losses of an entry of a training's history: "train/total", "heldout/total", ..."""
+    return {
+        f"{data}/{name}": value
+        for data in ("train", "heldout")
+        for name, value in entry[data].items()
+    }
+
+
+def returns_of(entry: dict) -> dict[str, float]:
+    """Returns and step size of a generation."""
+    worst, mean, best = np.ravel(fitness_curves([entry]))
+    values = {"worst": worst, "mean": mean, "best": best, "sigma": entry["sigma"]}
+    if entry.get("validation"):
+        values["validation"] = entry["validation"]["mean"]
+    return values
