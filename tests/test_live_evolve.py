@@ -54,6 +54,13 @@ def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
     evolve(page, 1)
     resumed = page.evaluate(LOG, 3)
     page.click("summary")
+    page.fill("#seed", "-5")
+    page.click("#restart")
+    assert "-5" in page.inner_text("#warning")
+    page.fill("#seed", "3")
+    page.click("#restart")  # one click asks, so nothing is lost by it
+    assert "generation 3" in page.inner_text("#warning")
+    assert page.evaluate("stad.page.log.length") == 3
     page.click("#restart")
     page.wait_for_function("stad.page.log.length === 0")
     evolve(page, 3)
@@ -80,7 +87,8 @@ def test_impatient_clicks_break_no_evolution(opened):
         }"""
     )
     page.wait_for_function("!stad.page.busy")
-    page.evaluate("document.querySelector('#restart').click()")
+    page.evaluate("restart.click()")
+    page.evaluate("stad.page.log.length && restart.click()")
     page.wait_for_function("stad.page.log.length === 0")
     evolve(page, 1)
     assert page.get_attribute("#live", "data-state") == "ready"

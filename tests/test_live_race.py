@@ -61,6 +61,24 @@ def test_a_finger_steers_with_gas_by_itself(opened):
     page.evaluate("(on) => { race.setPointerCapture = () => {}; "
                   "race.dispatchEvent(new PointerEvent('pointerdown', on)) }", down)  # fmt: skip
     page.wait_for_function("stad.page.state.action[0] < -0.5")
+    slide = down | {"clientX": box["x"] + box["width"] - 20}
+    page.evaluate("(on) => race.dispatchEvent(new PointerEvent('pointermove', on))", slide)
+    page.wait_for_function("stad.page.state.action[0] > 0.5")
+
+
+def test_a_lap_with_the_autopilot_is_no_record_of_the_reader(opened):
+    page = opened("race", "#track=5&agent=input_output")
+    page.keyboard.down("ArrowUp")
+    phase(page, "race")
+    page.click("#auto")
+    page.wait_for_function("stad.page.state.you.frames > 60 && stad.page.state.helped")
+    page.click("#auto")  # by hand, off the road and out of the field
+    page.keyboard.down("ArrowUp")
+    page.wait_for_selector("#live[data-phase=over]", timeout=60_000)
+    assert page.evaluate("localStorage.getItem('stad-race')") is None
+    assert "autopilot" in page.inner_text("#card")
+    page.click("#again")
+    page.wait_for_function("!stad.page.state.helped && stad.page.state.phase === 'race'")
 
 
 CLICK_ALL = "(one) => one.querySelectorAll('button').forEach((button) => button.click())"

@@ -169,9 +169,24 @@ stad.start(async () => {
     else go(Infinity);
   });
   get("step").addEventListener("click", () => go(driving ? 0 : 1)); // or no more than this one
-  get("restart").addEventListener("click", () =>
-    restart(stad.evolveSettings.fromControls()).catch(stad.fail),
-  );
+  // A driver that took minutes is not thrown away by one click.
+  get("restart").addEventListener("click", () => {
+    const wrong = stad.evolveSettings.wrong();
+    const sure = log.length === 0 || get("restart").dataset.asked === "true";
+    get("warning").textContent =
+      wrong ??
+      (sure ? "" : `This ends your driver of generation ${log.length}. Download it first?`);
+    ask(!wrong && !sure);
+    if (!wrong && sure) restart(stad.evolveSettings.fromControls()).catch(stad.fail);
+  });
+  get("restart").addEventListener("blur", () => {
+    get("warning").textContent = "";
+    ask(false);
+  });
+  function ask(on) {
+    get("restart").dataset.asked = on;
+    get("restart").textContent = on ? "Start afresh all the same" : "Start afresh";
+  }
   get("bet").addEventListener("input", ({ target }) => {
     bet = Number(target.value);
     showButtons();

@@ -25,6 +25,13 @@ stad.evolveSettings = {
     return this.parse(new Map(this.NAMES.map((name) => [name, stad.get(name).value])));
   },
 
+  /** What is wrong with the seed, the one setting that is typed; null if nothing is. */
+  wrong() {
+    const { value } = stad.get("seed");
+    if (/^\d{1,9}$/.test(value)) return null;
+    return `Seed ${value || "(empty)"}: give a whole number from 0 to 999999999.`;
+  },
+
   /** Whether the address names settings, and not just a place on the page. */
   get asked() {
     return location.hash.includes("seed=");

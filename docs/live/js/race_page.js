@@ -6,7 +6,8 @@ stad.start(async () => {
   const AGENTS = ["frame", "input", "output", "input_output", "cropped_input"];
   const [ORANGE, BLUE, PURPLE] = ["#E69F00", "#0072B2", "#CC79A7"];
   const SIZES = [32, 256]; // how many numbers z and h have
-  const [FIELD, VIEW] = [333, 62]; // world units: half the field, and the height of the picture
+  // World units: half the field, the height of the picture, and half the road's width.
+  const [FIELD, VIEW, HALF_WIDTH] = [333, 62, 6.67];
   const lacking = stad.whatIsMissing();
   if (lacking) throw new Error(lacking);
 
@@ -130,6 +131,7 @@ stad.start(async () => {
       drawCar(context, cars.you, ORANGE, 1);
     }
     context.restore();
+    if (state.phase === "race" && !asleep) drawWayBack(context, width, height, cars.you);
     drawMap(context, width, height, cars);
     drawSpeed(context, width, height, shown.speed);
     if (touching && state.phase === "race") drawPads(context, width, height);
@@ -147,6 +149,20 @@ stad.start(async () => {
       context.fillStyle = steers.has(side) ? "#fff" : "#fff9";
       context.fillText(sign, x, height / 2);
     }
+    if (state.you.frames < 4 * stad.FRAMES_A_SECOND && !steers.size)
+      drawHint(context, width, height);
+  }
+
+  /** What a finger does, until it has done it. */
+  function drawHint(context, width, height) {
+    context.font = "600 17px system-ui, sans-serif";
+    context.fillStyle = "#000b";
+    context.beginPath();
+    context.roundRect(width / 2 - 130, 0.28 * height - 25, 260, 62, 10);
+    context.fill();
+    context.fillStyle = "#fff";
+    context.fillText("Hold a side to steer.", width / 2, 0.28 * height);
+    context.fillText("Gas comes by itself.", width / 2, 0.28 * height + 24);
   }
 
   function drawGrass(context, { x, y }, wide) {
@@ -203,13 +219,49 @@ stad.start(async () => {
     context.globalAlpha = 1;
   }
 
+  /** An arrow to the road, for a car that has left it. */
+  function drawWayBack(context, width, height, { x, y, angle }) {
+    const distances = track.line.map(([a, b]) => Math.hypot(a - x, b - y));
+    const nearest = distances.indexOf(Math.min(...distances));
+    if (distances[nearest] < 2 * HALF_WIDTH) return;
+    const [a, b] = track.line[nearest];
+    const scale = height / VIEW;
+    context.save();
+    context.translate(width / 2, height * 0.72);
+    context.rotate(angle - Math.atan2(b - y, a - x)); // the picture turns with the car
+    context.translate(7 * scale, 0);
+    context.scale(scale, scale);
+    context.fillStyle = "#fff";
+    context.beginPath();
+    for (const [right, down] of [
+      [0, -0.6],
+      [3, -0.6],
+      [3, -1.8],
+      [6, 0],
+      [3, 1.8],
+      [3, 0.6],
+      [0, 0.6],
+    ])
+      context.lineTo(right, down);
+    context.fill();
+    context.restore();
+    context.fillStyle = "#fff";
+    context.font = "600 17px system-ui, sans-serif";
+    context.textAlign = "center";
+    context.fillText("The arrow leads back to the road.", width / 2, 0.3 * height);
+  }
+
   function drawMap(context, width, height, cars) {
     const side = Math.min(150, 0.3 * width);
     const [left, low, right, high] = track.box;
     const scale = (side - 16) / Math.max(right - left, high - low);
     const tall = (high - low) * scale + 16;
     const top = width < 500 ? height - tall - 8 : 8; // on a phone the scores are above
-    const place = ([x, y]) => [width - side + (x - left) * scale, top + 8 + (high - y) * scale];
+    const within = (value, size) => Math.max(5, Math.min(size - 5, value)); // off the road, too
+    const place = ([x, y]) => [
+      width - side - 8 + within(8 + (x - left) * scale, side),
+      top + within(8 + (high - y) * scale, tall),
+    ];
     context.fillStyle = "#fffd";
     context.beginPath();
     context.roundRect(width - side - 8, top, side, tall, 8);
@@ -227,6 +279,7 @@ stad.start(async () => {
     context.fill();
     context.fillStyle = "#fff";
     context.font = "600 15px system-ui, sans-serif";
+    context.textAlign = "left";
     context.fillText(`speed ${Math.round(speed)}`, 18, height - 28);
     context.fillStyle = speed > 70 ? "#ff8a5c" : "#9fd49a";
     context.fillRect(18, height - 22, Math.min(1, speed / 100) * 112, 6);
@@ -307,21 +360,27 @@ stad.start(async () => {
   }
 
   function showEnd() {
-    const { you, rival } = state;
+    const { you, rival, helped } = state;
     const [mine, its] = [you.score, rival.score];
-    const title = mine > its ? "You beat the agent!" : mine === its ? "A draw" : "The agent wins";
+    const won = mine > its ? "You beat the agent!" : mine === its ? "A draw" : "The agent wins";
+    const title = helped ? "The autopilot has driven" : won;
     const ways = ["The time is up", "A whole lap", "You left the field"];
-    const record = mine > (best[seed] ?? -Infinity);
+    const text =
+      `${ways[you.ending]} after ${seconds(you.frames)} s: ${mine.toFixed(1)} points. ` +
+      `The agent's whole episode gives ${its.toFixed(1)}. ${recordOf(mine, helped)}`;
+    showCard(title, text);
+    stad.announce(`${title} ${text}`);
+  }
+
+  /** The reader's best on this track; a lap with the autopilot is none. */
+  function recordOf(mine, helped) {
+    const record = !helped && mine > (best[seed] ?? -Infinity);
     if (record) {
       best[seed] = mine;
       keepBest();
     }
-    const text =
-      `${ways[you.ending]} after ${seconds(you.frames)} s. You ${mine.toFixed(1)} points, ` +
-      `the agent ${its.toFixed(1)}. Your best on this track: ${best[seed].toFixed(1)}` +
-      `${record ? ", just now" : ""}.`;
-    showCard(title, text);
-    stad.announce(`${title} ${text}`);
+    if (best[seed] === undefined) return "To have it counted, drive it yourself.";
+    return `Your best on this track: ${best[seed].toFixed(1)}${record ? ", just now" : ""}.`;
   }
 
   function keepBest() {
@@ -384,7 +443,7 @@ stad.start(async () => {
   function setAuto(on) {
     worker.postMessage({ type: "autopilot", on });
     get("auto").setAttribute("aria-pressed", String(on));
-    set("auto", on ? "Drive yourself" : "Let C drive");
+    set("auto", on ? "Drive yourself" : "Autopilot");
   }
 
   function wake() {
@@ -461,15 +520,22 @@ stad.start(async () => {
     { threshold: 0.4 },
   ).observe(get("race"));
 
-  // Touch: the left and the right half of the picture steer.
+  // Touch: the left and the right half of the picture steer, also of a finger that slides.
+  function steer(event) {
+    const { left, width } = get("race").getBoundingClientRect();
+    const place = (event.clientX - left) / width - 0.5;
+    const side = Math.abs(place) < 0.04 ? "straight" : place < 0 ? "left" : "right";
+    if (held.get(event.pointerId) === side) return;
+    held.set(event.pointerId, side);
+    sendPedals();
+  }
   get("race").addEventListener("pointerdown", (event) => {
     if (event.pointerType === "mouse" || state?.phase !== "race") return; // a click begins
     event.preventDefault();
-    const { left, width } = get("race").getBoundingClientRect();
-    held.set(event.pointerId, event.clientX < left + width / 2 ? "left" : "right");
     get("race").setPointerCapture(event.pointerId);
-    sendPedals();
+    steer(event);
   });
+  get("race").addEventListener("pointermove", (event) => held.has(event.pointerId) && steer(event));
   for (const end of ["pointerup", "pointercancel", "lostpointercapture"])
     get("race").addEventListener(end, ({ pointerId }) => held.delete(pointerId) && sendPedals());
   const brake = get("brake");

@@ -77,7 +77,7 @@ stad.Race = class {
 
   begin(phase) {
     for (const racer of [this.you, this.rival]) racer.reset(this.track);
-    this.you.autopilot = false;
+    [this.you.autopilot, this.helped] = [false, false];
     this.hand.action.fill(0);
     [this.phase, this.due] = [phase, performance.now()];
     this.tell(true);
@@ -108,6 +108,7 @@ stad.Race = class {
     } else if (this.phase === "attract") return this.begin("attract");
     if (this.phase !== "race") return;
     you.see(this.random);
+    this.helped ||= you.autopilot;
     const action = you.autopilot ? undefined : this.hand.act();
     this.hand.action.set(you.drive(action));
     if (you.car.over) this.finish();
@@ -135,6 +136,7 @@ stad.Race = class {
       you: you.report(),
       rival: rival.report(),
       asleep: shown.asleep,
+      helped: this.helped, // whether the autopilot has driven the reader's car
       action: Array.from(this.hand.action),
     };
     const often = you.asleep && this.phase === "race" ? 2 : 5; // steps

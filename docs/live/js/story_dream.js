@@ -163,6 +163,8 @@
     function begin(driver) {
       [dream, who, off, over] = [dreamOf(seed++), driver, 0, false];
       hand.action.fill(0);
+      part("answer").textContent = "";
+      for (const name of ["you", "agent"]) part(name).setAttribute("aria-pressed", name === who);
       clock.play();
       if (driver === "you") part("seat").focus({ preventScroll: true });
     }

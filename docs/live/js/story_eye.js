@@ -33,11 +33,11 @@ stad.figure("eye", async (part) => {
     const some = descriptions[NAME];
     return some.reduce((best, one, i) => (follows(one) > follows(some[best]) ? i : best), 0);
   });
-  const words = ["place on the road", "steering", "turning (yaw rate)"];
+  const words = ["distance from the middle of the road", "steering", "turning (yaw rate)"];
   const sliders = chosen.map((latent, i) => {
     const label = document.createElement("label");
     label.className = "wide";
-    label.innerHTML = `<span>${words[i]}, <i>z</i>[${latent}]</span><input type="range">`;
+    label.innerHTML = `<span>${words[i]}: number ${latent} of 32</span><input type="range">`;
     const range = label.querySelector("input");
     Object.assign(range, { min: -REACH, max: REACH, step: 0.05 });
     range.addEventListener("input", () => {

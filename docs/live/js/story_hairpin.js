@@ -38,10 +38,11 @@ stad.figure("hairpin", async (part) => {
     const near = Math.min(apart, track.count - apart) < 20;
     const text = tile === undefined
       ? `It stayed on the road, with ${car.score.toFixed(0)} points.`
-      : `${near ? "You found it" : "It was elsewhere"}: it first left the road in the bend at tile ${tile}, after ${(lost[0].frame / 50).toFixed(1)} seconds. ${car.score.toFixed(0)} points.`; // prettier-ignore
+      : `${near ? "You found it" : "It was elsewhere"}: it first left the road after ${(lost[0].frame / 50).toFixed(1)} seconds, at the first red dot. ${car.score.toFixed(0)} points.`; // prettier-ignore
     part("answer").textContent = text;
     stad.announce(text);
     part("race").hidden = false;
+    showGo();
     draw();
   }
 
@@ -101,14 +102,19 @@ stad.figure("hairpin", async (part) => {
     begun = true;
     if (clock.running) clock.pause();
     else clock.play();
-    part("go").textContent = "Pause or go on";
+    showGo();
   });
+  function showGo() {
+    const idle = begun && !over ? "Go on" : begun ? "Let it drive again" : "Let it drive";
+    part("go").textContent = clock.running ? "Pause" : idle;
+  }
   new ResizeObserver(draw).observe(part("map"));
   draw();
   return {
     run(on) {
       if (on && begun && !over) clock.play();
       else clock.pause();
+      showGo();
     },
   };
 });

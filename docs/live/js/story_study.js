@@ -39,7 +39,7 @@ stad.figure("study", async (part) => {
     draw();
     const text = rows.map(({ name, difference, interval }) => `${name}: ${difference.toFixed(1)} points (95% interval ${interval.map((end) => end.toFixed(1)).join(" to ")})`).join(". "); // prettier-ignore
     part("answer").textContent =
-      "No relevant gain was found. If the hand sees z alone, there is one: see below.";
+      "With its memory, no gain was found that matters. Without it, there is one: see below.";
     stad.describe(part("chart"), text);
     stad.announce(text);
     part("after").hidden = false;
