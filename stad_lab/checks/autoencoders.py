@@ -36,10 +36,16 @@ def kl_values(kl: Callable) -> None:
         "the sign is turned round: a KL divergence is never negative": -right,
         "this is the mean over the latents: nats add up, so sum": each.mean(1),
         "this is each latent by itself: sum over them": each,
+        "this is the sum over the pictures: sum over the latents (dim=1)": each.sum(0),
         "this is the sum over all pictures too: keep one number for each": each.sum(),
         "this is the mean over all pictures: keep one number for each": right.mean(),
     }
-    check("kl(mu, logvar)", ask("kl(mu, logvar)", kl, mu, logvar), right, mistakes)
+    what, leaves = "kl(mu, logvar)", (mu.clone().requires_grad_(), logvar.clone().requires_grad_())
+    found = ask(what, kl, *leaves)
+    check(what, found, right, mistakes)
+    if not found.requires_grad:
+        remedy = "then training cannot lower it: do not detach, and stay with PyTorch"
+        raise WrongAnswer(what, "no gradient comes back from it", remedy)
 
 
 def reparameterise_values(reparameterise: Callable) -> None:
@@ -55,6 +61,7 @@ def reparameterise_values(reparameterise: Callable) -> None:
         "there is no noise in it: multiply sigma by the noise that is given": mu + sigma,
         "this is the mean alone: add sigma times the noise": mu,
         "the mean is missing: add mu": sigma * noise,
+        "mu and noise are exchanged: it is the noise that sigma scales": noise + sigma * mu,
         "this noise was sampled by you: use the one that is given": mu + sigma * own,
     }
     leaves = [mu.clone().requires_grad_(), logvar.clone().requires_grad_()]
@@ -110,6 +117,8 @@ def silenced(silence: Callable) -> None:
         "you silenced pictures (rows): latents are columns, z[:, latents]": z
         * torch.tensor([[1.0], [0.0]]),
         "nothing was silenced: assign 0 to z[:, latents] of the copy": z.clone(),
+        "this is the mean of these pictures: the prior's mean is 0": z * keep
+        + (1 - keep) * z.mean(0),
         "1 is not the mean of the prior: set these latents to 0": z * keep + (1 - keep),
     }
     what = "silence(z, [1, 4])"

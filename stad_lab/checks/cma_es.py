@@ -93,6 +93,9 @@ def ablated(ablate: Callable) -> None:
             "only the row of steering was changed: zero the column in all three": np.append(
                 right[:288], given[288:]
             ),
+            "these are places of the flat list: reshape the weights to (3, 288) first": np.where(
+                np.isin(position, position[asked]), 0, given
+            ),
             "nothing was changed: reshape may give a copy; assign into a view of your copy": given,
         }
         if without_h is not None:

@@ -33,6 +33,16 @@ def region_masks(frames: np.ndarray) -> dict[str, np.ndarray]:
     return {"road": ~grass & ~car, "grass": grass & ~car, "car": car}
 
 
+def road_ahead(frames: np.ndarray) -> np.ndarray:
+    """Where the road leads: its mean column in the upper half of the picture, right is positive.
+
+    Frames as `region_masks` takes them -> float (n,), pixels from the middle; 0 without a road.
+    """
+    upper = region_masks(frames)["road"][:, :32]
+    columns = np.arange(upper.shape[2]) - upper.shape[2] / 2 + 0.5
+    return (upper * columns).sum(axis=(1, 2)) / np.maximum(upper.sum(axis=(1, 2)), 1)
+
+
 class Reconstruction(NamedTuple):
     """What V makes of n frames."""
 

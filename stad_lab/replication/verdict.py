@@ -45,27 +45,25 @@ def describe_meaning(primary: dict[str, dict]) -> str:
     both, alone = (describe_effect(primary[features]) for features in SEES)
     if both == alone:
         return f"Whatever C sees, {both}."
-    return f"If C sees z and h, as in the paper, {both}; if it sees z alone, {alone}."
+    return f"If C sees z and h, as in the paper, {both}. If it sees z alone, {alone}."
 
 
 def describe_effect(one: dict) -> str:
     """What one comparison says about the effect of `input_output`."""
-    low, high = one["interval"]
+    (low, high), change = one["interval"], abs(one["difference"])
     if one["verdict"] == "gain":
-        return "`input_output` raises the score" + describe_size(low, high)
+        return "`input_output` raises the score by " + describe_size(change, low, high)
     if one["verdict"] == "harm":
-        return "`input_output` lowers the score" + describe_size(-high, -low)
+        return "`input_output` lowers the score by " + describe_size(change, -high, -low)
     if one["verdict"] == "no relevant gain":
         return f"`input_output` gains at most about {max(high, 0):.0f} points"
     below = f", but is below {MARGIN} points"
     return "the effect of `input_output` stays open" + below * (high < MARGIN)
 
 
-def describe_size(least: float, most: float) -> str:
-    """Whether an effect between these bounds, above 0, is relevant."""
-    if least >= MARGIN:
-        return ""
-    return f", {'' if most < MARGIN else 'perhaps '}by less than {MARGIN} points"
+def describe_size(change: float, least: float, most: float) -> str:
+    """An effect with its bounds, all above 0, beside the limit of relevance."""
+    return f"{change:.0f} points (95% interval {least:.0f} to {most:.0f}; relevant from {MARGIN})"
 
 
 def describe_secondary(comparisons: dict[str, dict]) -> str:

@@ -6,12 +6,16 @@
 Without an answer, or without a kernel, a lesson reads on all the same.
 """
 
+import json
 from collections.abc import Sequence
 from html import escape
+from pathlib import Path
 from typing import cast
 
 import ipywidgets
+import numpy as np
 from IPython.display import HTML, DisplayHandle
+from PIL import Image
 
 from stad_lab.viz.plots import BLUE, GREEN, RED
 
@@ -117,3 +121,17 @@ def quiz(*questions: tuple[str, list[Option], int]) -> HTML:
             summary = f"<summary>{escape(answer)}</summary>"
             parts.append(f'<details style="{style}">{summary}{verdict}</details>')
     return HTML(f"<div>{''.join(parts)}</div>")
+
+
+def recorded_networks(folder: Path) -> tuple[list[dict], np.ndarray, np.ndarray]:
+    """The V networks of the page on the KL weight, and what they make of the same frames.
+
+    Returns facts of each network, frames uint8 (frames, 64, 64, 3), and the reconstructions uint8
+    (networks, frames, 64, 64, 3). `docs/live/record_nat.py` trains and records them.
+    """
+    facts = json.loads((folder / "nat.json").read_text(encoding="utf-8"))
+    networks, count = facts["networks"], facts["frames"]
+    sheet = np.asarray(Image.open(folder / "nat.webp").convert("RGB"))
+    # A row of the sheet is a frame (above) or its difference image; the first column is the truth.
+    cells = sheet.reshape(count, 2, 64, len(networks) + 1, 64, 3)[:, 0].transpose(2, 0, 1, 3, 4)
+    return networks, cells[0], cells[1:]

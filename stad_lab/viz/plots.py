@@ -89,7 +89,11 @@ def difference_colors(difference: np.ndarray) -> np.ndarray:
 
 
 def plot_pictures(
-    rows: list[list[np.ndarray | None]], columns: list[str], names: list[str], title: str
+    rows: list[list[np.ndarray | None]],
+    columns: list[str],
+    names: list[str],
+    title: str,
+    scale_name: str = "difference d",
 ) -> Figure:
     """Pictures in a grid.
 
@@ -98,6 +102,7 @@ def plot_pictures(
             their mean over the colours on one scale; None leaves a gap.
         columns: titles of the columns.
         names: of the rows; "" for none.
+        scale_name: label of the difference images' scale.
     """
     size = 1.7 * len(columns) + 0.8, 1.75 * len(rows) + 0.75
     figure, axes = new_figure(*size, len(rows), len(columns))
@@ -117,7 +122,7 @@ def plot_pictures(
     for column, axis in zip(columns, axes[0], strict=True):
         caption(axis, column)
     if drawn is not None:
-        figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label="difference d")
+        figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label=scale_name)
     lead = f"Rows: {', '.join(filter(None, names)) or 'one'}; columns: "
     return describe(figure, title, lead, columns)
 
@@ -618,7 +623,7 @@ def plot_learning(generations: list[dict], total: int, title: str) -> Figure:
     axis.axhline(SOLVED, **THIN)
     axis.set(xlabel="generation", ylabel="return of an episode", xlim=(0.5, total + 0.5))
     axis.set_ylim(min(-20, returns.min() - 20), 960)
-    axis.legend(**SMALL, loc="upper left")
+    legend_below(figure, axis)
     means = f"average return {returns[0].mean():.0f} at first, {returns[-1].mean():.0f} at last"
     return describe(figure, title, f"{len(generations)} generations: {means}")
 

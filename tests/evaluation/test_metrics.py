@@ -20,6 +20,7 @@ from stad_lab.evaluation.metrics import (
     reconstruct,
     region_masks,
     repeat_prediction,
+    road_ahead,
     single_step_nll,
     two_peaks,
     vae_metrics,
@@ -194,3 +195,12 @@ def test_two_peaks_are_found_with_the_valley_between_them_and_one_peak_is_not():
     one = two_peaks(even, np.array([-0.05, 0.05]), narrow)
     both = two_peaks(*(np.stack([part] * 2) for part in (even, even, narrow)))
     assert not one.any() and both.shape == (2, 3) and not both.any()
+
+
+def test_the_road_ahead_is_where_its_upper_half_lies():
+    frames = np.zeros((3, 64, 64, 3), np.uint8)
+    frames[..., 1] = 200  # grass
+    frames[0, :, 40:50] = 100  # a road to the right
+    frames[1, :32, 4:14] = 100  # one that leads to the left
+    right, left, none = road_ahead(frames)
+    assert right > 10 and left < -20 and none == 0

@@ -13,11 +13,19 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import blocks
 
 OUTCOMES = {  # interval and Holm's p, and the effect that the meaning names
-    "gain": ([12.3, 80.1], 0.0004, "raises the score, perhaps by less than 30 points"),
-    "large gain": ([31.0, 80.0], 0.0004, "`input_output` raises the score"),
-    "small gain": ([4.0, 25.0], 0.01, "raises the score, by less than 30 points"),
-    "harm": ([-50.2, -4.0], 0.012, "lowers the score, perhaps by less than 30 points"),
-    "small harm": ([-25.5, -4.0], 0.012, "lowers the score, by less than 30 points"),
+    "gain": (
+        [12.3, 80.1],
+        0.0004,
+        "raises the score by 46 points (95% interval 12 to 80",
+    ),
+    "large gain": ([31.0, 80.0], 0.0004, "raises the score by 56 points (95% interval 31 to 80"),
+    "small gain": ([4.0, 25.0], 0.01, "raises the score by 14 points (95% interval 4 to 25"),
+    "harm": (
+        [-50.2, -4.0],
+        0.012,
+        "lowers the score by 27 points (95% interval 4 to 50",
+    ),
+    "small harm": ([-25.5, -4.0], 0.012, "lowers the score by 15 points (95% interval 4 to 26"),
     "no relevant gain": ([-29.6, 11.0], 0.3, "gains at most about 11 points"),
     "undecided": ([-20.0, 41.0], 0.2, "the effect of `input_output` stays open"),
     "undecided, no gain": ([-45.0, 20.0], 0.2, "stays open, but is below 30 points"),
