@@ -12,13 +12,13 @@ from pathlib import Path
 from gallery import CELLS, PICTURES
 from PIL import Image
 
+from stad_course import cli as course_cli
 from stad_lab import cli, config
 from stad_lab.agent import PRETRAINED
 from stad_lab.evaluation.trajectories import MOTION
-from stad_lab.replication.claims import PAPER
-from stad_lab.replication.study_claims import FAMILIES, FEATURES, MARGIN
-from stad_lab.replication.verdict import PAPER_GAIN, describe_meaning, describe_verdict
-from stad_lab.viz.replication import (
+from stad_study import cli as study_cli
+from stad_study.claims import PAPER
+from stad_study.figures import (
     DRIVERS,
     SEEN,
     SOURCES,
@@ -30,6 +30,8 @@ from stad_lab.viz.replication import (
     plot_scores,
     plot_study,
 )
+from stad_study.study_claims import FAMILIES, FEATURES, MARGIN
+from stad_study.verdict import PAPER_GAIN, describe_meaning, describe_verdict
 
 PACKAGE = Path(config.__file__).parent
 AGENTS = (*config.VARIANTS, "cropped_input")
@@ -76,13 +78,16 @@ def verdict(claims: dict) -> str:
 
 def gains(claims: dict) -> str:
     """The two primary differences in one line, for the front page."""
-    comparisons = claims["study1"]["comparisons"]
-    found = [difference_of(comparisons[f"{features}: input_output"]) for features in SEEN]
+    comparisons, told = claims["study1"]["comparisons"], []
+    for features in SEEN:
+        one = comparisons[f"{features}: input_output"]
+        low, high = one["interval"]
+        told.append(f"{one['difference'] + 0.0:.0f} points ({low:.0f} to {high:.0f})")
     return (
-        "Does it help to see what has moved? On average of 12 pairs of agents it changed the score"
-        f" by {found[0]} of about 900 points for agents with a memory, and by {found[1]} without"
-        " (in brackets: 95% intervals)."
-    )
+        "Does it help to see what has moved? A paper says so. In our study of twelve pairs it adds"
+        f" {told[1]} to agents without a memory, and {told[0]} to agents with one. In brackets:"
+        " 95% intervals."
+    ).replace(" -0 ", " 0 ")
 
 
 def verdict_figure(claims: dict) -> str:
@@ -165,13 +170,16 @@ def area_of(study: dict, features: str, variant: str) -> str:
 
 
 def study3(claims: dict, driver: str) -> str:
-    """R2 from z, and from z and h, with one driver: means over the seeds with intervals."""
-    found, lines = claims["study3"], []
+    """R2 from z, and from z and h, with one driver: means over the seeds."""
+    found, lines, widest = claims["study3"], [], 0.0
     names = [name for name in found if name.startswith(f"{driver}: ")]
     for features, name in itertools.product(FEATURES, names):
-        cells = [r2_cell(found[name][features][quantity]) for quantity in MOTION]
+        ones = [found[name][features][quantity] for quantity in MOTION]
+        widest = max([widest, *(high - low for low, high in (one["interval"] for one in ones))])
+        cells = [fixed(one["mean"]) for one in ones]
         lines.append([network(name.partition(": ")[2]), SOURCES[features], *cells])
-    return table(("V", "from", *MOTION), lines)
+    told = f"The 95% intervals over the seeds are at most {widest:.2f} wide."
+    return table(("V", "from", *MOTION), lines) + f"\n\n{told}"
 
 
 def turning_table(claims: dict) -> str:
@@ -379,11 +387,14 @@ def stages_table(claims: dict) -> str:
 
 def commands_table(claims: dict) -> str:
     """The commands, with the first line of their help."""
-    lines = [
-        (f"`{name}`", (command.__doc__ or "").strip().partition("\n")[0].rstrip("."))
-        for name, command in cli.COMMANDS.items()
-    ]
-    return table(("command", "what it does"), lines)
+    parts = []
+    for program in (cli.PROGRAM, course_cli.PROGRAM, study_cli.PROGRAM):
+        lines = [
+            (f"`{name}`", (command.__doc__ or "").strip().partition("\n")[0].rstrip("."))
+            for name, command in program.commands.items()
+        ]
+        parts += [table((f"`{program.name}`", "what it does"), lines)]
+    return "\n\n".join(parts)
 
 
 def settings_table(claims: dict) -> str:
@@ -417,24 +428,30 @@ def modules_list(claims: dict) -> str:
 
 
 def modules() -> list[str]:
-    """All modules of the library, lower layers first, by the contract in pyproject.toml."""
+    """All modules: the library's, lower layers first as in pyproject.toml, and those beside it."""
     settings = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text("utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     place = {part: -height for height, one in enumerate(layers) for part in re.findall(r"\w+", one)}
     files = [file.relative_to(PACKAGE).with_suffix("") for file in PACKAGE.rglob("*.py")]
     names = [".".join(file.parts) for file in files if not file.name.startswith("__")]
     order = sorted(names, key=lambda name: (place[name.split(".")[0]], name))
-    return [f"stad_lab.{name}" for name in order]
+    beside = [
+        ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts)
+        for package in ("stad_course", "stad_study")
+        for file in sorted((PACKAGE.parent / package).rglob("*.py"))
+        if not file.name.startswith("__")
+    ]
+    return [*(f"stad_lab.{name}" for name in order), *beside]
 
 
 def gallery(claims: dict) -> str:
     """Some figures of the notebooks, with the alternative texts that their files hold."""
     shown = []
-    for cell in CELLS:
+    for cell, words in CELLS.items():
         file = PICTURES / f"{cell}.png"
         text = Image.open(file).text["Description"].replace("$", "")
         (notebook,) = (PICTURES.parent).glob(f"{cell.partition('-')[0]}_*.ipynb")
-        caption = f"[{text.partition('.')[0]}](../notebooks/{notebook.name})"
+        caption = f"[{words}](../notebooks/{notebook.name})"
         picture = f"![{text}](../notebooks/pictures/{file.name})"
         shown.append(f"```{{container}} shown\n{picture}\n\n{caption}\n```")
     return "\n\n".join(["````{container} gallery", *shown, "````"])

@@ -21,17 +21,20 @@ from stad_lab.config import PRESET_VARIABLE
 gc.set_threshold(100_000)  # Sphinx keeps what it makes: it looks for garbage a sixth of the time
 
 HERE = Path(__file__).parent
-PACKAGE = HERE.parent / "stad_lab"
+PACKAGES = [HERE.parent / name for name in ("stad_lab", "stad_study", "stad_course")]
 sys.path[:0] = [str(HERE), str(HERE / "live")]
 from colab import address  # noqa: E402
 from live_build import write_scripts  # noqa: E402
 from site_check import faults  # noqa: E402
 
 
-def digest(folder: Path) -> str:
-    """A short hash of all files of a folder, which names the cache of outputs."""
+def digest(folders: list[Path]) -> str:
+    """A short hash of all files of some folders, which names the cache of outputs."""
     files = sorted(
-        file for file in folder.rglob("*") if file.is_file() and "__pycache__" not in file.parts
+        file
+        for folder in folders
+        for file in folder.rglob("*")
+        if file.is_file() and "__pycache__" not in file.parts
     )
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:12]
 
@@ -68,7 +71,7 @@ suppress_warnings = ["myst.header"]  # a cell may begin at the second heading le
 PRESET = os.environ.get(PRESET_VARIABLE, "laptop")
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads that wait for each other are slow
 nb_execution_mode = "cache"
-nb_execution_cache_path = str(HERE / "_cache" / f"{PRESET}-{digest(PACKAGE)}")
+nb_execution_cache_path = str(HERE / "_cache" / f"{PRESET}-{digest(PACKAGES)}")
 nb_execution_excludepatterns = ["notebooks/exercises/*"]  # their answers are missing
 nb_execution_timeout = 600
 nb_execution_raise_on_error = True

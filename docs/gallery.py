@@ -14,7 +14,15 @@ from nbclient import NotebookClient
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 PICTURES = NOTEBOOKS / "pictures"
-CELLS = ("00-11", "01-16", "02-33", "02b-22", "03-31", "04-19", "06-15")
+CELLS = {  # and what the front page says below
+    "00-11": "How long may you disturb the agent before it is lost?",
+    "01-16": "What has changed in four frames shows the speed",
+    "02-33": "A network that has to save drops the road",
+    "02b-22": "How fast the car turns, read off 32 numbers",
+    "03-31": "A real drive, and four dreams of it",
+    "04-19": "A driver evolves: cars of four generations",
+    "06-15": "A good agent misses a hairpin",
+}
 
 
 def figure_of(cell: str) -> bytes:

@@ -15,8 +15,8 @@ from pathlib import Path
 from blocks import BLOCKS, FIGURES, NUMBERS, front_matter
 from gallery import PICTURES
 
-from stad_lab.replication.claims import read_claims
 from stad_lab.viz.plots import to_png
+from stad_study.claims import read_claims
 
 ROOT = Path(__file__).parent.parent
 CARDS = ROOT / "stad_lab" / "pretrained"

@@ -25,7 +25,7 @@ import blocks  # noqa: E402
 import renew  # noqa: E402
 
 from stad_lab.config import Config  # noqa: E402
-from stad_lab.replication.claims import PAPER, read_claims  # noqa: E402
+from stad_study.claims import PAPER, read_claims  # noqa: E402
 
 SOURCES = ("metadata.yaml", "bibliography.bib")
 TEMPLATE = ("article.tex", "header.tex", "rescience.cls", "article.py", "yaml-to-latex.py")

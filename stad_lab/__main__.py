@@ -3,14 +3,10 @@
 import io
 import sys
 
-from stad_lab.streams import make_streams_last, open_missing_streams
-
-LONG = ("train", "fine-tune", "replicate", "latents", "probe-study", "probe")  # print progress
+from stad_lab.streams import open_program
 
 if __name__ == "__main__":
-    open_missing_streams()
-    if sys.argv[1:2] and sys.argv[1] in LONG:
-        make_streams_last()
+    open_program(progress=("train", "fine-tune", "probe"))
     if sys.argv[1:] == ["check"]:  # it must run where the command line's own packages are missing
         from stad_lab.doctor import tell_environment
 

@@ -194,7 +194,7 @@ def rollout(
         driver: is shown what the cars see whose episodes go on.
         batch: of cars at the start of their episodes.
         max_frames: of an episode, at most 1,000 as in CarRacing.
-        patience: an episode ends after so many frames without a new tile; 0 for never.
+        patience: maximum number of frames without a new tile; 0 for no limit.
         observe: called before every step with the numbers of the cars, what they see, and actions.
     """
     max_frames = whole_number("max_frames", max_frames, 1)
@@ -276,8 +276,8 @@ def load_agent(source: str | Path, controller: str | Path | None = None) -> Agen
     folder = run_folder(source)
     if not (folder / CONTROLLER_FILE).exists():
         raise FileNotFoundError(
-            f"{str(source)!r} is no trained agent: expected {', '.join(shipped_agents())}, or the"
-            " folder of a finished run of `python -m stad_lab train`"
+            f"no trained agent named {str(source)!r}: expected {', '.join(shipped_agents())}, or"
+            " the folder of a finished run of `python -m stad_lab train`"
         )
     parameters, metadata = load_controller(file := Path(controller or folder / CONTROLLER_FILE))
     world_model = load_world_model(folder)

@@ -56,7 +56,7 @@ class DataConfig:
     agent_frames: int = 1000
     """Frames of an agent's episode, at most."""
     agent_patience: int = 100
-    """An agent's episode ends after so many frames without a new tile; 0 for never."""
+    """Maximum number of frames without a new tile in an agent's episode; 0 for no limit."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ class EvolutionConfig:
     initial_gas: float = -0.5
     """Gas output of the first controller before squashing; (tanh(-0.5) + 1) / 2 is 27% gas."""
     patience: int = 100
-    """A training episode ends after so many frames without a new tile; 0 for never."""
+    """Maximum number of frames without a new tile in a training episode; 0 for no limit."""
     max_frames: int = 1000
     """Frames of a training or validation episode, at most."""
     cars: int = 16

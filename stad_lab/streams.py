@@ -57,3 +57,10 @@ class Lasting:
 def make_streams_last() -> None:
     """Let this process outlive the readers of its output."""
     sys.stdout, sys.stderr = Lasting(sys.stdout), Lasting(sys.stderr)
+
+
+def open_program(progress: tuple[str, ...]) -> None:
+    """Prepare the streams of a command line; commands in `progress` outlive their readers."""
+    open_missing_streams()
+    if sys.argv[1:2] and sys.argv[1] in progress:
+        make_streams_last()

@@ -314,7 +314,7 @@ def test_an_agent_that_is_not_there_is_an_error_that_names_the_choices(tmp_path)
     # V and M of cropped_frame are shipped without a C.
     for source in ("both", tmp_path, tmp_path / "nowhere", "cropped_frame", "", ".", ".."):
         message = (
-            "is no trained agent: expected .*frame, input, .*, or the folder of a finished run"
+            "no trained agent named .*: expected .*frame, input, .*, or the folder of a finished"
         )
         with pytest.raises(FileNotFoundError, match=message):
             load_agent(source)

@@ -14,8 +14,9 @@ import pytest
 import torch
 from PIL import Image, ImageSequence
 
-from stad_lab import cli
-from stad_lab.cli import COMMANDS, main, parse
+from stad_course import cli as course
+from stad_lab import cli, command_line
+from stad_lab.cli import main, parse
 from stad_lab.config import PRESETS, VARIANTS, Config, fields_of
 from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors
 from stad_lab.io.weights import (
@@ -30,6 +31,7 @@ from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training.pipeline import STAGES
 from stad_lab.training.record import command_of
+from stad_study import cli as study
 
 QUICK = Config.preset("quick")
 
@@ -73,10 +75,10 @@ def the_error(capsys, *arguments):
     return line
 
 
-def help_of(capsys, *arguments):
+def help_of(capsys, *arguments, program=cli):
     """What a command prints with --help, without its frame, on one line."""
     with pytest.raises(SystemExit) as ended:
-        call(*arguments, "--help")
+        program.main([*arguments, "--help"])
     assert not ended.value.code
     return " ".join(re.sub(r"[─│╭╮╰╯]", "", capsys.readouterr().out).split())
 
@@ -186,11 +188,14 @@ def test_the_command_in_a_record_asks_for_the_configuration_of_that_record(monke
 # Help
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_has_a_sentence_for_every_option_of_a_command(command, capsys):
-    text = help_of(capsys, command)
+@pytest.mark.parametrize(
+    ("program", "command"),
+    [(one, name) for one in (cli, study, course) for name in one.COMMANDS],
+)
+def test_help_has_a_sentence_for_every_option_of_a_command(program, command, capsys):
+    text = help_of(capsys, command, program=program)
     options = re.findall(r"(?<![\w-])--[\w.-]+", text)
-    assert command in ("check", "claims", "verify", "ship") or len(options) > 2
+    assert command in ("check", "claims", "verify", "ship", "kit", "commit") or len(options) > 2
     for option, following in re.findall(r"(--[a-z][\w.-]+) (?:\S+ )(.*?)(?= --[a-z]|$)", text):
         assert re.search(r"[a-z]{3}", following), option
 
@@ -206,7 +211,7 @@ def test_help_of_train_names_every_field_with_its_sentence_and_default(capsys):
 
 def test_the_first_help_names_every_command(capsys):
     text = help_of(capsys)
-    assert [command for command in COMMANDS if command not in text] == []
+    assert [command for command in cli.COMMANDS if command not in text] == []
 
 
 # Every option reaches what it is for
@@ -218,7 +223,7 @@ def test_the_options_of_train_reach_the_pipeline(monkeypatch):
     options = "--variant input --dataset shared --earlier first --until mdn_rnn"
     assert call(*train_quickly("run", *options.split())) == 0
     config = QUICK.replace(variant="input")
-    assert told == [(config, Path("run"), "shared", "mdn_rnn", None, "first")]
+    assert told == [(config, Path("run"), "shared", "mdn_rnn", None, "first", None)]
 
 
 def test_the_options_of_fine_tune_reach_it(monkeypatch, quick_run):
@@ -300,7 +305,7 @@ def test_a_wrong_name_or_value_ends_in_one_clear_line(options, parts, tmp_path, 
         ("train quick", "--out"),
         ("", "Missing subcommand"),
         ("driving", "driving"),
-        ("evaluate --agent nowhere", "'nowhere' is no trained agent: expected "),
+        ("evaluate --agent nowhere", "no trained agent named 'nowhere': expected "),
         ("verify nowhere", "nowhere"),
     ],
 )
@@ -320,7 +325,7 @@ def test_an_error_of_a_user_has_no_traceback(tmp_path, command_line):
 
 @pytest.mark.parametrize(
     "command",
-    ["train quick", "fine-tune --run frame", "replicate paper_frame", "latents"],
+    ["train quick", "fine-tune --run frame"],
 )
 @pytest.mark.parametrize("out", ["", " "])
 def test_an_empty_out_is_refused_and_never_means_this_folder(
@@ -387,7 +392,7 @@ def test_a_preset_may_stand_anywhere_and_a_wrong_one_in_the_environment_breaks_t
 )
 def test_memory_that_is_too_short_is_named_as_such(message):
     for error in (RuntimeError(message), TaskError(f"drive_group failed in a worker: {message}")):
-        assert cli.explain(error) == f"too large for this machine: {error}"
+        assert command_line.explain(error) == f"too large for this machine: {error}"
 
 
 @pytest.mark.parametrize("made", [True, False])
@@ -396,7 +401,7 @@ def test_a_missing_or_empty_run_folder_ends_in_one_clear_line(made, tmp_path, ca
     if made:
         folder.mkdir()
     error = the_error(capsys, *evaluate_quickly(folder))
-    assert f"'{folder}' is no trained agent" in error
+    assert f"no trained agent named '{folder}'" in error
     assert "the folder of a finished run of `python -m stad_lab train`" in error
 
 
@@ -506,5 +511,5 @@ def test_a_folder_whose_letters_the_console_lacks_is_no_error(quick_run, tmp_pat
 
 
 def test_parsing_a_command_does_not_run_it(monkeypatch):
-    monkeypatch.setitem(cli.COMMANDS, "claims", lambda: pytest.fail("it ran"))
-    assert callable(parse(["claims"]))
+    monkeypatch.setitem(cli.COMMANDS, "ship", lambda: pytest.fail("it ran"))
+    assert callable(parse(["ship"]))

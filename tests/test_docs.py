@@ -19,10 +19,12 @@ import yaml
 from matplotlib.figure import Figure
 from PIL import Image
 
+from stad_course import cli as course
+from stad_lab import cli, command_line
 from stad_lab.agent import PRETRAINED, shipped_agents
-from stad_lab.cli import parse
 from stad_lab.evaluation.evaluate import load_evaluation
-from stad_lab.replication.claims import read_claims
+from stad_study import cli as study
+from stad_study.claims import read_claims
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs"))
@@ -149,8 +151,12 @@ def test_links_resolve_and_no_marker_of_a_number_begins_a_line(name):
 @pytest.mark.parametrize("name", PAGES)
 def test_every_command_on_a_page_is_one_that_the_command_line_takes(name):
     text = PAGES[name].read_text(encoding="utf-8").replace("\\\n", " ")
-    for line in re.findall(r"^python -m stad_lab (.*)$", text, re.M):
-        parse(shlex.split(line, comments=True))
+    for package, line in re.findall(r"^python -m stad_(lab|study|course) (.*)$", text, re.M):
+        words = shlex.split(line, comments=True)
+        if package == "lab":
+            cli.parse(words)
+        else:
+            command_line.parse({"study": study, "course": course}[package].PROGRAM, words)
 
 
 @pytest.mark.parametrize("name", ["instructor", "glossary"])

@@ -11,7 +11,8 @@ import stad_lab
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "stad_lab"
-FILES = sorted(PACKAGE.rglob("*.py"))
+PACKAGES = ("stad_lab", "stad_study", "stad_course")
+FILES = sorted(file for name in PACKAGES for file in (ROOT / name).rglob("*.py"))
 MODELS = sorted((PACKAGE / "models").glob("*.py"))
 CORE = [
     PACKAGE / "envs" / "frames.py",
@@ -26,7 +27,7 @@ UNSAFE = {"pickle", "dill", "joblib", "shelve", "marshal"}
 
 def name_of(file):
     """The id of a file in a test's name."""
-    return file.relative_to(PACKAGE).as_posix()
+    return file.relative_to(ROOT).as_posix()
 
 
 def parse(file):

@@ -84,12 +84,13 @@ def test_the_library_requires_every_package_that_it_imports():
     distributions = importlib.metadata.packages_distributions()
     extras = {name for some in EXTRAS.values() for name in by_name(some)}
     brought = {"box2d", "pygame-ce"}  # by gymnasium[box2d]
-    for file in (ROOT / "stad_lab").rglob("*.py"):
+    own = ("stad_lab", "stad_study", "stad_course")
+    for file in [file for name in own for file in (ROOT / name).rglob("*.py")]:
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
             modules = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             modules += [node.module] if isinstance(node, ast.ImportFrom) else []
             for module in {one.partition(".")[0] for one in modules}:
-                if module == "stad_lab" or module in sys.stdlib_module_names:
+                if module in own or module in sys.stdlib_module_names:
                     continue
                 names = {normal(one) for one in distributions.get(module, [module])}
                 assert names & {*by_name(CORE), *extras, *brought}, (file.name, module)

@@ -17,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from safetensors.numpy import load_file, save
 
-from stad_lab.replication.study_claims import MARGIN
+from stad_study.study_claims import MARGIN
 
 HERE = Path(__file__).parent
 PRETRAINED = HERE.parents[1] / "stad_lab" / "pretrained"
-CLAIMS = HERE.parents[1] / "stad_lab" / "replication" / "data" / "claims.json"
+CLAIMS = HERE.parents[1] / "stad_study" / "data" / "claims.json"
 AGENTS = ("frame", "input", "output", "input_output", "cropped_input")
 # What workers run: a page that is opened from the disk cannot give them a file.
 NETWORKS = ("layers", "vae", "mdn_rnn", "controller", "agent")

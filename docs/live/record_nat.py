@@ -22,8 +22,8 @@ from PIL import Image
 from stad_lab.config import Config
 from stad_lab.envs.frames import difference_image, earlier_frames
 from stad_lab.evaluation.metrics import reconstruct, vae_metrics
+from stad_lab.evaluation.probe_run import random_trajectories
 from stad_lab.io.weights import VAE_FILE, load_vae
-from stad_lab.replication.latents import random_trajectories
 from stad_lab.training.pipeline import train
 from stad_lab.viz.plots import difference_colors
 

@@ -83,7 +83,7 @@ def road_in_sight(motion: np.ndarray) -> np.ndarray:
 
 
 def record(driver: Driver, cars: Cars, frames: int) -> Trajectory:
-    """Drive one car on, for at most so many frames."""
+    """Drive one car on, for at most this number of frames."""
     recorder = Recorder(cars)
     episodes = rollout(driver, cars, max_frames=frames, observe=recorder)
     return recorder.trajectory(episodes.rewards[0])

@@ -46,7 +46,7 @@ def locked(folder: Path, wait: float = 0.0) -> Iterator[None]:
         message = f"{folder} is in use by another process: wait for it, or choose another folder"
         raise BlockingIOError(message) from None
     except OSError as error:
-        message = f"{folder} is no folder to write to ({error.strerror}): choose another one"
+        message = f"cannot write to folder {folder} ({error.strerror}): choose another one"
         raise OSError(message) from error
     try:
         for file in folder.glob(".*.part"):

@@ -20,9 +20,10 @@ from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.io.dask_cluster import check_address, check_versions, cluster, versions
 from stad_lab.io.files import load_json
 from stad_lab.io.workers import TaskError, run_tasks
-from stad_lab.replication.study import STUDIES, Study, evaluate_kept, run_study
 from stad_lab.training.dataset import collect
 from stad_lab.training.evolution import LOG, evolve
+from stad_study import cli as study
+from stad_study.study import STUDIES, Study, evaluate_kept, run_study
 
 WORKERS = 2
 QUICK = Config.preset("quick")
@@ -118,10 +119,10 @@ def test_the_command_line_evolves_on_a_cluster(scheduler, quick_run, tmp_path):
 
 
 def test_the_command_line_runs_an_experiment_on_a_cluster(scheduler, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("stad_lab.replication.run.TRACKS", 3)
+    monkeypatch.setattr("stad_study.run.TRACKS", 3)
     command, episodes = ["replicate", "constant_driver", "--out"], []
     for name, where in (("far", ["--scheduler", scheduler[0]]), ("near", [])):
-        assert main([*command, str(tmp_path / name), *where]) == 0
+        assert study.main([*command, str(tmp_path / name), *where]) == 0
         result = tmp_path / name / "constant_driver" / "seed0" / "evaluation.json"
         episodes.append(load_json(result)["episodes"])
     assert len(episodes[0]) == 3 and episodes[0] == episodes[1]
@@ -136,13 +137,13 @@ def test_the_command_line_runs_a_study_on_a_cluster(scheduler, tmp_path, monkeyp
     monkeypatch.setattr(run_study, "__defaults__", (None, None, None, tmp_path / "data"))
     monkeypatch.setattr(evaluate_kept, "__defaults__", (None, None, tmp_path / "networks", None))
     name, far, episodes = "seed0/input_output/z_h", ["--scheduler", scheduler[0]], []
-    assert main(["replicate", "brief", "--out", str(tmp_path / "far"), *far]) == 0
-    assert main(["replicate", "brief", "--only", name, "--out", str(tmp_path / "near")]) == 0
+    assert study.main(["replicate", "brief", "--out", str(tmp_path / "far"), *far]) == 0
+    assert study.main(["replicate", "brief", "--only", name, "--out", str(tmp_path / "near")]) == 0
     assert f"{name}: bit-identical to the recorded one, all 3 returns" in capsys.readouterr().out
     for where in (far, []):
         scores = tmp_path / f"{len(episodes)}.json"
-        drive = ["evaluate-study", "brief", "--first-track", "7", "--episodes", "2"]
-        assert main([*drive, "--json", str(scores), *where]) == 0
+        drive = ["evaluate", "brief", "--first-track", "7", "--episodes", "2"]
+        assert study.main([*drive, "--json", str(scores), *where]) == 0
         episodes.append(load_json(scores)["agents"][name]["episodes"])
     assert len(episodes[0]) == 2 and episodes[0] == episodes[1]
 

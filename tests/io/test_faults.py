@@ -500,7 +500,7 @@ def test_a_read_only_folder_is_refused_before_any_work(small_disk, quick_run, ca
     run = start_of("mdn_rnn", quick_run, disk / "run")
     small_disk(64, "ro")
     assert main(stage_arguments(run, "mdn_rnn")) == 2
-    error = f"error: {run} is no folder to write to (Read-only file system): choose"
+    error = f"error: cannot write to folder {run} (Read-only file system): choose"
     assert error in capsys.readouterr().err
     begin = time.perf_counter()
     result = str(disk / "evaluation.json")

@@ -1,0 +1,166 @@
+"""Checks of the exercises to the notebooks on autoencoders. Each takes the student's function."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+
+import numpy as np
+import torch
+
+from stad_course.checks.answers import WrongAnswer, ask, check, check_interval
+from stad_lab.envs.frames import earlier_index
+
+
+def codes() -> torch.Tensor:
+    """Means, log-variances and noise of six pictures: (3, 6, 32)."""
+    return torch.randn(3, 6, 32, generator=torch.Generator().manual_seed(1))
+
+
+def kl_values(kl: Callable) -> None:
+    """The KL divergence of six pictures, in nats."""
+    mu, logvar, _ = codes()
+    normal = torch.distributions.Normal
+    sigma, variance = torch.exp(0.5 * logvar), logvar.exp()
+    each = torch.distributions.kl_divergence(normal(mu, sigma), normal(0.0, 1.0))
+    right = each.sum(1)
+    mistakes = {
+        "the factor 1/2 is missing": 2 * right,
+        "the 1 is missing: a latent with mu = 0 and sigma = 1 must cost nothing": right + 16,
+        "exp(0.5 * logvar) is sigma, and the formula wants its square: take exp(logvar)": right
+        + 0.5 * (sigma - variance).sum(1),
+        "the sign of the logarithm is turned round: a narrow q has a larger KL": right
+        + logvar.sum(1),
+        "logvar is the logarithm of sigma squared, not of sigma: read the formula again": 0.5
+        * (mu**2 + variance**2 - 1 - 2 * logvar).sum(1),
+        "this is how much N(0, 1) diverges from q: exchange the two": 0.5
+        * ((mu**2 + 1) / variance - 1 + logvar).sum(1),
+        "the sign is turned round: a KL divergence is never negative": -right,
+        "this is the mean over the latents: nats add up, so sum": each.mean(1),
+        "this is each latent by itself: sum over them": each,
+        "this is the sum over the pictures: sum over the latents (dim=1)": each.sum(0),
+        "this is the sum over all pictures too: keep one number for each": each.sum(),
+        "this is the mean over all pictures: keep one number for each": right.mean(),
+    }
+    what, leaves = "kl(mu, logvar)", (mu.clone().requires_grad_(), logvar.clone().requires_grad_())
+    found = ask(what, kl, *leaves)
+    check(what, found, right, mistakes)
+    if not found.requires_grad:
+        remedy = "then training cannot lower it: do not detach, and stay with PyTorch"
+        raise WrongAnswer(what, "no gradient comes back from it", remedy)
+
+
+def reparameterise_values(reparameterise: Callable) -> None:
+    """The sample that a given noise stands for, and the gradients that pass through it."""
+    mu, logvar, noise = codes()
+    sigma, what = torch.exp(0.5 * logvar), "reparameterise(mu, logvar, noise)"
+    torch.manual_seed(0)
+    own = torch.randn(6, 32)
+    mistakes = {
+        "exp(logvar) is the variance, and noise is scaled by sigma: take its root": mu
+        + logvar.exp() * noise,
+        "logvar is a logarithm: take exp(0.5 * logvar)": mu + logvar * noise,
+        "there is no noise in it: multiply sigma by the noise that is given": mu + sigma,
+        "this is the mean alone: add sigma times the noise": mu,
+        "the mean is missing: add mu": sigma * noise,
+        "mu and noise are exchanged: it is the noise that sigma scales": noise + sigma * mu,
+        "this noise was sampled by you: use the one that is given": mu + sigma * own,
+    }
+    leaves = [mu.clone().requires_grad_(), logvar.clone().requires_grad_()]
+    torch.manual_seed(0)
+    z = ask(what, reparameterise, *leaves, noise)
+    check(what, z, mu + sigma * noise, mistakes)
+    if not z.requires_grad:
+        remedy = "do not detach, and do not sample inside torch.no_grad()"
+        raise WrongAnswer(what, "no gradient comes back from z", remedy)
+    z.sum().backward()
+    for name, leaf in zip(("mu", "logvar"), leaves, strict=True):
+        if leaf.grad is None:
+            remedy = "then the encoder cannot learn it"
+            raise WrongAnswer(what, f"no gradient reaches {name}", remedy)
+    print("gradients reach mu and logvar, though z is a sample")
+
+
+def active_latents(active: Callable) -> None:
+    """The latents with more than 0.05 nats, and those with more than 1."""
+    nats = np.array(
+        [
+            [0.9, 0.4, 0.04, 2.0, 0.0, 0.0],
+            [0.3, 0.4, 0.04, 4.0, 0.06, 0.1],
+            [0.3, 0.4, 0.03, 3.0, 0.0, 0.0],
+        ]
+    )
+    once = "latents 4 and 5 have more than 0.05 in one frame only: take the mean over the frames"
+    missing = "the threshold is missing, or this is the sum over the frames: take the mean"
+    mistakes = {
+        "the largest KL comes first: reverse the order": [1, 0, 3],
+        "this is the median over the frames: take the mean": [3, 1, 0],
+        "this is the order of the numbers, not of the nats: sort by the nats": [0, 1, 3],
+        once: [3, 0, 1, 5, 4],
+        missing: [3, 0, 1, 2, 5, 4],
+        "this says which latents are active, as bools: return their numbers": nats.mean(0) > 0.05,
+        "these are nats: return the numbers of the latents": np.array([3.0, 0.5, 0.4]),
+    }
+    check("active(nats)", ask("active(nats)", active, nats), np.array([3, 0, 1]), mistakes)
+    mistakes = {
+        "the threshold is not used: compare with `threshold`": [3, 0, 1],
+        "this says which latents are active, as bools: return their numbers": nats.mean(0) > 1,
+        "this is a share of the frames: take the mean over the frames": [3, 0],
+    }
+    check("active(nats, 1.0)", ask("active(nats, 1.0)", active, nats, 1.0), np.array([3]), mistakes)
+
+
+def silenced(silence: Callable) -> None:
+    """Two latents of two pictures, set to zero in a copy."""
+    z = torch.arange(1.0, 13.0).reshape(2, 6)
+    keep = torch.tensor([1.0, 0.0, 1.0, 1.0, 0.0, 1.0])
+    mistakes = {
+        "these latents were kept, and the others silenced: set the named ones to 0": z * (1 - keep),
+        "you silenced pictures (rows): latents are columns, z[:, latents]": z
+        * torch.tensor([[1.0], [0.0]]),
+        "nothing was silenced: assign 0 to z[:, latents] of the copy": z.clone(),
+        "this is the mean of these pictures: the prior's mean is 0": z * keep
+        + (1 - keep) * z.mean(0),
+        "1 is not the mean of the prior: set these latents to 0": z * keep + (1 - keep),
+    }
+    what = "silence(z, [1, 4])"
+    check(what, ask(what, silence, z, np.array([1, 4])), z * keep, mistakes)
+
+
+def reactions(reaction: Callable, encode: Callable) -> None:
+    """The reaction of a V that one can compute by hand, at strides 4 and 2."""
+    vae, brightness = SimpleNamespace(encode=encode), np.arange(120) ** 2 // 60
+    film = np.ones((120, 64, 64, 3), np.uint8) * brightness.astype(np.uint8)[:, None, None, None]
+    expected = {}
+    for k in (4, 2):
+        d = brightness - brightness[earlier_index(np.arange(120), k)]
+        turned = 2 * d[50:]
+        moved = np.hypot(brightness[50:] - brightness[:-50], d[50:] - d[:-50])
+        expected[k] = right = turned.mean() / moved.mean()
+        one_norm = np.linalg.norm(turned) / np.linalg.norm(moved)
+        mistakes = {
+            "this compares d with 0: compare with -d": right / 2,
+            "it is upside down: the second between frames belongs below": 1 / right,
+            "one norm over all frames: take each frame's (dim=1)": one_norm,
+            "this is the mean of ratios: divide the means": (turned / moved).mean(),
+            "begin with frame 50 in both means": 2 * d.mean() / moved.mean(),
+            "stride is not used: give it to earlier_frames": expected[4],
+        }
+        what = f"reaction(vae, film, {k})"
+        check(what, ask(what, reaction, vae, film, k), right, mistakes)
+
+
+def mean_intervals(mean_interval: Callable) -> None:
+    """The bootstrap interval of the mean of twelve values."""
+    values = np.array([3.0, 9.0, 4.0, 1.0, 5.0, 2.0, 6.0, 5.0, 3.0, 12.0, 5.0, 5.0])
+    place = "say where an episode lies, not the mean"
+    bounds = {
+        f"these are percentiles of the values, which {place}: resample": (1.275, 11.175),
+        "this is a 90% interval: take the percentiles 2.5 and 97.5": (3.75, 6.45),
+        "nearly a point: draw with replacement, and take the mean of each sample": (5.0, 5.0),
+        "this is the formula with 1.96, which is symmetric, and these values are not: draw": (
+            3.37,
+            6.63,
+        ),
+        f"two standard deviations around the mean {place}: resample": (-0.9, 10.9),
+    }
+    given = values, np.random.default_rng(0)
+    check_interval("mean_interval", mean_interval, given, (3.5, 6.8), bounds, 0.02)

@@ -1,0 +1,159 @@
+"""Checks of the exercises to notebook 03. Each takes the student's functions."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch.distributions import Categorical, MixtureSameFamily, Normal
+
+from stad_course.checks.answers import WrongAnswer, ask, check, check_interval
+
+
+def mixtures() -> tuple[torch.Tensor, ...]:
+    """Mixtures of five Gaussians: logpi, mean, logsigma, log-widths, each (4, 6, 5)."""
+    generator = torch.Generator().manual_seed(2)
+    mean = torch.randn(4, 6, 5, generator=generator)
+    logpi = torch.randn(4, 6, 5, generator=generator).log_softmax(-1)
+    widths = 0.5 * torch.randn(4, 6, 5, generator=generator)
+    return logpi, mean, torch.full((4, 6, 5), -0.5), widths
+
+
+def log_density_values(log_density: Callable) -> None:
+    """The log density of targets near the mixtures."""
+    target = torch.rand(4, 6, generator=torch.Generator().manual_seed(3))
+    check_log_density(log_density, target, "log_density")
+
+
+def log_density_far(log_density: Callable) -> None:
+    """The log density a thousand away, where every density is 0 in the computer."""
+    far = torch.full((4, 6), 1e3)
+    what = "log_density, 1000 away"
+    found = ask(what, log_density, *mixtures()[:3], far)
+    if isinstance(found, torch.Tensor) and torch.isinf(found).any():
+        hint = "exp(-1360000) is 0 in the computer, and ln 0 is -inf: sum inside torch.logsumexp"
+        wrong = f"the answer is {found.flatten()[0].item()}: expected about -1.36e6"
+        raise WrongAnswer(what, wrong, hint)
+    check_log_density(log_density, far, what)
+
+
+def check_log_density(log_density: Callable, target: torch.Tensor, what: str) -> None:
+    """Check a log density of targets (4, 6)."""
+    logpi, mean, logsigma, _ = mixtures()
+    each, shift = Normal(mean, logsigma.exp()).log_prob(target[..., None]), 0.5 * np.log(2 * np.pi)
+    choice = Categorical(logits=logpi)
+    right = MixtureSameFamily(choice, Normal(mean, logsigma.exp())).log_prob(target)
+    halved = MixtureSameFamily(choice, Normal(mean, (0.5 * logsigma).exp())).log_prob(target)
+    mistakes = {
+        "the weights are missing: add logpi before you sum over the Gaussians": each.logsumexp(-1),
+        "the factor 1 / sigma is missing: a narrow Gaussian is higher": right - 0.5,
+        "the factor 1 / sqrt(2 pi) is missing": right + shift,
+        "the factor 1/2 before the square is missing": torch.logsumexp(
+            logpi + 2 * each + logsigma + shift, -1
+        ),
+        "logsigma is ln sigma here, not ln sigma squared: take its exponential": halved,
+        "these are logarithms of negative numbers: logpi is a logarithm already, so add it": (
+            torch.full((4, 6), torch.nan)
+        ),
+        "densities add up, their logarithms do not: use logsumexp over the Gaussians": (
+            logpi + each
+        ).sum(-1),
+        "this is a weighted mean of logarithms: sum densities, then take the logarithm": (
+            logpi.exp() * each
+        ).sum(-1),
+        "this is a density: return its logarithm": right.exp(),
+        "the sign is turned round: this is the loss, the negative logarithm": -right,
+        "no clamp, and nothing added inside the log": right.clamp(min=-1e5),
+    }
+    found = ask(what, log_density, logpi, mean, logsigma, target)
+    check(what, found, right, mistakes)
+
+
+def moments_of_mixtures(moments: Callable) -> None:
+    """Mean and deviation of mixtures."""
+    logpi, mean, _, widths = mixtures()
+    parts, pi = Normal(mean, widths.exp()), logpi.exp()
+    both = MixtureSameFamily(Categorical(logits=logpi), parts)
+    within, mixed = (pi * parts.variance).sum(-1), (pi * widths.exp()).sum(-1)
+    between = both.variance - within
+    unweighed = ((mean - both.mean[..., None]) ** 2).mean(-1)
+    mistakes = {
+        "the parts lie apart, and that is missing: add the variance of their means": within.sqrt(),
+        "variances may be averaged, deviations may not; and the spread of the means is missing": (
+            mixed
+        ),
+        "the parts are wide, and that is missing: add their mean variance": between.sqrt(),
+        "weigh the squares by pi = exp(logpi)": (within + unweighed).sqrt(),
+        "exp(logsigma) is a deviation, its square exp(2 * logsigma) a variance": (
+            mixed + between
+        ).sqrt(),
+        "this is the variance: take its square root": both.variance,
+        "add variances, then take the root: deviations do not add up": within.sqrt()
+        + between.sqrt(),
+    }
+    found = ask("moments", moments, logpi, mean, widths)
+    some = isinstance(found, tuple | list) or (isinstance(found, torch.Tensor) and found.ndim > 0)
+    if not some or len(found) != 2:
+        wrong = "moments must return two tensors"
+        raise WrongAnswer("moments", wrong, "return mean, deviation")
+    weigh = "weigh each mean by pi = exp(logpi)"
+    centers = {weigh: mean.mean(-1), f"logpi is negative: {weigh}": (logpi * mean).sum(-1)}
+    check("the mean", found[0], both.mean, centers)
+    check("the deviation", found[1], both.stddev, mistakes)
+
+
+def horizons(horizon: Callable) -> None:
+    """The horizon of three episodes: where errors cross once, twice, and never."""
+    dream = np.array(
+        [[1.0, 6.0, 2.0, 4.0, 6.0], [1.0, 5.0, 5.0, 13.0, 13.0], [1.0, 1.0, 1.0, 1.0, 3.0]]
+    )
+    constant = np.repeat([[5.0], [10.0], [2.0]], 5, axis=1)
+    most = (
+        "at this step most episodes err more, or it is the last one: compare sums, find the first"
+    )
+    mistakes = {
+        "steps count from 1: the first column is one step": 3,
+        "only a single episode errs more there: take the sums over the episodes": 2,
+        most: 5,
+    }
+    check("horizon", ask("horizon", horizon, dream, constant), 4, mistakes)
+    twice, what = dream[:, [0, 3, 1, 4]], "horizon, if they meet twice"
+    mistakes = {
+        "the dreams come back, and err more again: find the first place": 4,
+        "steps count from 1: the first column is one step": 1,
+    }
+    check(what, ask(what, horizon, twice, constant[:, :4]), 2, mistakes)
+    what = "horizon, if dreams never err more"
+    mistakes = {
+        "argmax of no True at all is 0: ask first whether there is one": 1,
+        "steps count from 1: the last is the number of steps": 4,
+    }
+    check(what, ask(what, horizon, dream, 9 + constant), 5, mistakes)
+
+
+def horizon_intervals(horizon_interval: Callable) -> None:
+    """The interval of a horizon, where episodes are alike, and where they differ."""
+    source = np.random.default_rng(8)
+    grown = source.gamma(4.0, 0.25, (15, 1)) * np.linspace(0.1, 2.5, 60)
+    dream = grown + 0.3 * source.standard_normal((15, 60))
+    single = (
+        "far too wide: these are horizons of single episodes; draw 15, take one horizon of them"
+    )
+    steps = "steps of one episode belong together: sample episodes, not a set of them for each step"
+    mean = "this is the mean of single episodes' horizons: take the horizon of the summed errors"
+    same = "without replacement every sample is the same: sample with replacement"
+    narrow = "this is a 90% interval: take the percentiles 2.5 and 97.5"
+    bounds = {single: (8.35, 54.05), steps: (19, 33), narrow: (22, 37)}
+    bounds |= {mean: (14.67, 28.6), same: (30, 30)}
+    given = dream, np.ones((15, 60)), np.random.default_rng(0)
+    check_interval("horizon_interval", horizon_interval, given, (19, 39), bounds, 0.032)
+    source = np.random.default_rng(9)
+    hard = source.gamma(2.0, 0.5, (15, 1))  # on a hard episode both errors are large
+    grown = hard * source.gamma(4.0, 0.25, (15, 1)) * np.linspace(0.1, 2.5, 60)
+    bounds = {
+        "the constant's errors are of the same episodes: draw them along": (18, 44.5),
+        "both errors of an episode belong together: sample the episodes once, for both": (16, 48.5),
+    }
+    dream = grown + 0.1 * source.standard_normal((15, 60))
+    given = dream, np.repeat(hard, 60, axis=1), np.random.default_rng(0)
+    what = "horizon_interval, where episodes differ"
+    check_interval(what, horizon_interval, given, (23, 33), bounds, 0.032)

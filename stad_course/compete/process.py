@@ -1,0 +1,255 @@
+"""The parent's end of a submission's process: limits, isolation, and what went wrong in one line.
+
+On Linux with user namespaces the process has no network, sees no process but its own, cannot write
+outside its folder, and cannot see the hidden tracks or other submissions. Elsewhere it has the
+rights of whoever runs the competition.
+"""
+
+import contextlib
+import functools
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+import stad_lab
+from stad_course.compete.child import PROCESSES
+from stad_course.compete.limits import Limits
+from stad_course.compete.protocol import receive, send
+
+PAUSE = 0.05  # seconds between two looks of the watchdog
+LARGEST_SUBMISSION = 300_000_000  # bytes
+LOWEST, HIGHEST = (-1.0, 0.0, 0.0), (1.0, 1.0, 1.0)  # steering, gas and brake
+# In new namespaces: hide $2 (a file), and the folders after --; only the folder $1 is writable.
+ISOLATE = """
+set -e
+work=$1; shift
+mount --bind "$work" "$work"
+while [ "$1" != -- ]; do
+  if [ -d "$1" ]; then mount -t tmpfs none "$1"; else mount --bind /dev/null "$1"; fi
+  shift
+done
+shift
+while [ "$1" != -- ]; do
+  mount --bind "$1" "$1"; mount -o remount,bind,ro "$1"; shift
+done
+shift
+mount -o remount,bind,ro /
+cd "$work"
+exec "$@"
+"""
+UNSHARE = ["unshare", "--user", "--map-root-user", "--net", "--ipc", "--mount", "--pid", "--fork"]
+UNSHARE += ["--kill-child", "--mount-proc"]
+
+
+class Failure(Exception):
+    """A submission broke a rule or broke down; the message is one line for its author."""
+
+
+@functools.cache
+def can_isolate() -> bool:
+    """Whether this system lets us start processes in namespaces of their own."""
+    if sys.platform != "linux" or not shutil.which("unshare"):
+        return False
+    with tempfile.TemporaryDirectory() as work:
+        command = [*UNSHARE, "sh", "-c", ISOLATE, "sh", work, "--", "--", "true"]
+        return subprocess.run(command, capture_output=True).returncode == 0
+
+
+class Submission:
+    """A submission's process, as a `Driver` for `rollout`; use it in a `with` block.
+
+    Its methods raise Failure, after which the process has been killed.
+
+    Args:
+        path: a file or a folder, of which the process gets a copy.
+        limits: what it may use.
+        used: seconds that it has used before.
+        hidden: files and folders that it must not see.
+
+    Attributes:
+        used: seconds that it has used.
+    """
+
+    def __init__(
+        self, path: Path, limits: Limits, used: float = 0.0, hidden: tuple[Path, ...] = ()
+    ):
+        self.limits, self.used, self.hidden = limits, used, hidden
+        self.deadline, self.broken, self.fresh = float("inf"), "", True
+        self.folder = Path(tempfile.mkdtemp(prefix="stad_lab-")).resolve()
+        try:
+            self.process = self._start(copied(path, self.folder))
+            threading.Thread(target=self._watch, daemon=True).start()
+            self._ask(self.limits.start)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> "Submission":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+    def reset(self) -> None:
+        """Begin new episodes, with as many cars as the first `act_batch` shows."""
+        self.begins = True
+
+    def act_batch(self, seen: np.ndarray) -> np.ndarray:
+        """Actions float64 (cars, 3), clipped to their ranges, for observations of the cars."""
+        count = len(seen)
+        if self.begins:
+            self._ask(self.limits.start, "reset", cars=count)
+            self.begins = False
+        seconds = self.limits.start if self.fresh else self.limits.step * count
+        actions = self._ask(seconds, "act", seen)
+        self.fresh = False
+        if actions.shape != (count, 3) or not np.isfinite(actions).all():
+            raise self._failed("its answer is not three finite numbers for each car")
+        return np.clip(actions, LOWEST, HIGHEST)
+
+    def keep(self, cars: np.ndarray) -> None:
+        """Continue with some of the present cars."""
+        self._ask(self.limits.start, "keep", cars=cars.tolist())
+
+    def close(self) -> None:
+        """End the process, with all that it started."""
+        if process := getattr(self, "process", None):
+            self._kill()
+            for stream in (process.stdin, process.stdout):
+                with contextlib.suppress(OSError):
+                    stream.close()
+            process.wait()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _start(self, path: Path) -> subprocess.Popen[bytes]:
+        package = Path(stad_lab.__file__).resolve().parent
+        command = [sys.executable, "-P", "-m", "stad_course.compete.child", str(path)]
+        command.append(str(round(self.limits.memory * 1e9)))
+        isolated = can_isolate()
+        if isolated:
+            hidden = [str(one.resolve()) for one in self.hidden if one.exists()]
+            fixed = [str(package), str(Path(sys.prefix).resolve())]
+            own = [str(self.folder), *hidden, "--", *fixed, "--"]
+            command = [*UNSHARE, "sh", "-c", ISOLATE, "sh", *own, *command]
+        kept = ("PATH", "LANG", "SYSTEMROOT", "NUMBA_CACHE_DIR", "LD_LIBRARY_PATH")
+        environment = {name: os.environ[name] for name in kept if name in os.environ} | {
+            "PYTHONPATH": str(package.parent),
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "PYTHONIOENCODING": "utf-8",
+            "OMP_NUM_THREADS": "1",
+            "CUDA_VISIBLE_DEVICES": "",
+            "HOME": str(self.folder),
+            "TMPDIR": str(self.folder),
+            "MPLCONFIGDIR": str(self.folder),
+            "STAD_LAB_ISOLATED": "1" if isolated else "",
+        }
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd=self.folder,
+            env=environment,
+            start_new_session=os.name != "nt",
+        )
+
+    def _ask(self, seconds: float, kind: str = "", array=None, **fields) -> np.ndarray:
+        """Send a message, if there is one, and return the array of the answer."""
+        stdin, stdout = self.process.stdin, self.process.stdout
+        assert stdin is not None and stdout is not None  # pipes
+        begin = time.monotonic()
+        left = self.limits.total - self.used if kind == "act" else seconds
+        self.deadline = begin + min(seconds, left)
+        try:
+            if kind:
+                send(stdin, kind, array, **fields)
+            most = 0 if array is None else len(array) * 3 * 8
+            answer, actions = receive(stdout, np.float64, most)
+        except (EOFError, OSError):
+            raise self._failed(self._ending()) from None
+        except (ValueError, TypeError, RecursionError):
+            raise self._failed("it wrote into the pipe of its answers") from None
+        finally:
+            self.deadline = float("inf")
+            if kind == "act" and not self.fresh:
+                self.used += time.monotonic() - begin
+        if answer.get("kind") == "error":
+            raise self._failed(self.broken or str(answer.get("text"))[:500])
+        return actions
+
+    def _failed(self, reason: str) -> Failure:
+        self._kill()
+        return Failure(reason)
+
+    def _ending(self) -> str:
+        """Why the process has ended."""
+        if self.broken:
+            return self.broken
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(2)
+        status = self.process.returncode
+        if status is not None and status < 0:
+            return f"its process was ended by {signal.Signals(-status).name}"
+        return f"its process ended by itself (exit status {status})"
+
+    def _watch(self) -> None:
+        """Kill the process when it takes too long or too much, until it ends."""
+        while self.process.poll() is None:
+            if time.monotonic() > self.deadline:
+                late = self.used + self.limits.step > self.limits.total
+                over = f"{self.limits.total:g} s in all" if late else f"{self.limits.step:g} s"
+                over = over if not self.fresh else f"{self.limits.start:g} s to begin"
+                self.broken = f"it took longer than the limit of {over}"
+            else:
+                self.broken = self._excess()
+            if self.broken:
+                return self._kill()
+            time.sleep(PAUSE)
+
+    def _excess(self) -> str:
+        """What the process and its descendants take too much of; empty if nothing."""
+        with contextlib.suppress(psutil.Error):
+            family = psutil.Process(self.process.pid)
+            family = [family, *family.children(recursive=True)]
+            if len(family) > PROCESSES:
+                return f"it started more than {PROCESSES} processes"
+            used = 0
+            for one in family:
+                with contextlib.suppress(psutil.Error):
+                    used += one.memory_info().rss
+            if used > self.limits.memory * 1e9:
+                return f"it needs more memory than the limit of {self.limits.memory:g} GB"
+        return ""
+
+    def _kill(self) -> None:
+        family = []
+        with contextlib.suppress(psutil.Error):
+            family = psutil.Process(self.process.pid).children(recursive=True)
+        with contextlib.suppress(OSError):
+            self.process.kill()
+        for one in family:
+            with contextlib.suppress(psutil.Error):
+                one.kill()
+
+
+def copied(path: Path, folder: Path) -> Path:
+    """A copy of a submission in a folder. Failure if it is too large."""
+    files = [path] if path.is_file() else [one for one in path.rglob("*") if one.is_file()]
+    size = sum(one.lstat().st_size for one in files)
+    if size > LARGEST_SUBMISSION:
+        raise Failure(
+            f"it has {size / 1e6:.0f} MB, at most {LARGEST_SUBMISSION / 1e6:.0f} are read"
+        )
+    target = folder / path.name
+    if path.is_file():
+        return Path(shutil.copyfile(path, target))
+    return Path(shutil.copytree(path, target, symlinks=True))

@@ -1,0 +1,56 @@
+"""The command `compete`: from a folder of submissions to a leaderboard."""
+
+import shutil
+from pathlib import Path
+
+from stad_course.compete.drive import (
+    BASELINES,
+    STARTER,
+    check_submission,
+    compete,
+    find_submissions,
+)
+from stad_course.compete.limits import Limits
+from stad_course.compete.page import leaderboard
+from stad_course.compete.process import can_isolate
+from stad_course.compete.ranking import rank
+from stad_course.compete.tracks import hide_tracks, load_tracks
+from stad_lab.io.files import locked, write_bytes
+
+__all__ = ["check_submission", "hide_tracks", "run", "write_kit"]
+BASELINE = "baseline-"  # before the names of our own
+
+
+def run(
+    submissions: Path,
+    secret: Path,
+    out: Path,
+    limits: Limits,
+    processes: int = 2,
+    reveal: bool = False,
+    baselines: bool = True,
+) -> Path:
+    """Drive all submissions and the baselines, and write the leaderboard; returns its path."""
+    tracks, commitment = load_tracks(secret)
+    ours = BASELINES if baselines else {}
+    entries = {f"{BASELINE}{name}": path for name, path in ours.items()}
+    entries |= find_submissions(submissions)
+    with locked(out):
+        hidden = secret, out, submissions
+        results = compete(entries, tracks, out / "results", limits, processes, hidden)
+        table = rank(results)
+        table["baseline"] = table["name"].str.startswith(BASELINE)
+        table["name"] = table["name"].str.removeprefix(BASELINE)
+        seeds = secret.read_text(encoding="utf-8") if reveal else None
+        facts = {"isolated": can_isolate(), "revealed": seeds}
+        file = out / "leaderboard.html"
+        write_bytes(file, leaderboard(table, tracks, commitment, facts).encode())
+    return file
+
+
+def write_kit(file: Path) -> str:
+    """Write a first agent to a file that does not exist yet; says how to try it."""
+    if file.exists():
+        raise FileExistsError(f"{file} exists: choose another name")
+    shutil.copyfile(STARTER / "my_agent.py", file)
+    return f"written to {file}; try it: python -m stad_course check {file}"

@@ -1,0 +1,194 @@
+"""The command line of the studies, `python -m stad_study COMMAND`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from stad_lab import command_line
+from stad_lab.command_line import cluster_of, output
+from stad_lab.config import STUDY_TRACKS, Config
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit status. A user's error ends in one line."""
+    return command_line.run(PROGRAM, arguments)
+
+
+def replicate(
+    experiment: tyro.conf.Positional[str],
+    out: str,
+    seeds: list[int] | None = None,
+    only: list[str] | None = None,
+    keep: bool = False,
+    scheduler: str | None = None,
+) -> None:
+    """Run a study of the protocol, such as study1, or an earlier experiment, with all its seeds.
+
+    It says first how long it will take. Stop it when you like; the same command continues. The
+    pipelines of a study are added to the tables of stad_study/data as they finish.
+
+    Args:
+        experiment: Its name: study1, study5, pilot, or one of docs/experiments.md.
+        out: Folder of all experiments, for example runs/replication.
+        seeds: Some of its seeds; all if not given.
+        only: Some pipelines of a study, such as seed0/frame/z, or runs of study5, such as
+            seed0/frame/z/1. Known ones are compared.
+        keep: Only add the finished seeds of an earlier experiment to the tables.
+        scheduler: Address of a Dask scheduler, to drive on a cluster.
+    """
+    from stad_study import run, study, study5
+
+    folder = output(out)
+    if experiment == study5.STUDY:
+        if keep or scheduler:
+            raise ValueError("study5 takes neither --keep nor --scheduler")
+        study5.run_study5(folder, seeds, only)
+        return
+    if experiment in study.STUDIES:
+        if keep:
+            raise ValueError("--keep is for earlier experiments: a study adds its own pipelines")
+        with cluster_of(scheduler) as executor:
+            study.run_study(experiment, folder, executor, seeds, only)
+        return
+    if only:
+        raise ValueError(f"--only {only[0]}: {experiment!r} is no study, and has seeds alone")
+    if keep:
+        kept = run.keep(experiment, folder, seeds)
+        print("\n".join(f"kept {name}" for name in kept) or "no seed is finished")
+        return
+    with cluster_of(scheduler) as executor:
+        print(run.describe_time(experiment, seeds), flush=True)
+        print(run.describe(experiment, run.replicate(experiment, folder, executor, seeds)))
+
+
+def evaluate(
+    study: tyro.conf.Positional[str],
+    first_track: int = STUDY_TRACKS.start,
+    episodes: int = len(STUDY_TRACKS),
+    seeds: list[int] | None = None,
+    only: list[str] | None = None,
+    json: Path | None = None,
+    scheduler: str | None = None,
+) -> None:
+    """Drive the kept agents of a study on any tracks, with the fast renderer.
+
+    The tracks of the study's own score give its returns again, bit-identical on the same kind of
+    processor.
+
+    Args:
+        study: Its name, such as study1.
+        first_track: Seed of the first track.
+        episodes: Number of tracks.
+        seeds: Some seeds; all that are kept if not given.
+        only: Some pipelines, such as seed0/frame/z.
+        json: Where to write every episode.
+        scheduler: Address of a Dask scheduler, to drive on a cluster.
+    """
+    from stad_lab.evaluation.evaluate import check_output, check_tracks
+    from stad_lab.io.files import save_json
+    from stad_study.study import evaluate_kept
+
+    check_tracks(episodes, first_track)
+    if json:
+        check_output(json)
+    found, tracks = {}, range(first_track, first_track + episodes)
+    with cluster_of(scheduler) as executor:
+        for pipeline, result in evaluate_kept(study, tracks, seeds, only, executor=executor):
+            low, high = result["interval"]
+            text = f"mean return {result['mean']:.1f}, 95% interval {low:.1f} to {high:.1f}"
+            print(f"{pipeline.name}: {text}", flush=True)
+            found[pipeline.name] = result
+            if json:
+                save_json(json, {"kind": "study", "study": study, "agents": found})
+
+
+def probe(
+    study: tyro.conf.Positional[str], seeds: list[int] | None = None, processes: int = 2
+) -> None:
+    """Probe the kept V and M of a study's complete seeds, and add the results to the tables.
+
+    Stop it when you like; the same command continues.
+
+    Args:
+        study: Its name, such as study1.
+        seeds: Some of its seeds; all complete ones if not given.
+        processes: Worker processes.
+    """
+    from stad_study.study_probe import probe_study
+
+    probed = probe_study(study, seeds, processes=processes)
+    print(f"probed the seeds {probed}" if probed else "no further seed is complete: nothing to do")
+
+
+def claims() -> None:
+    """Compute every statistic of the replication from its tables, and write claims.json."""
+    from stad_study.claims import write_claims
+
+    print(f"written to {write_claims()}")
+
+
+def latents(
+    out: str,
+    preset: Literal["quick", "laptop", "paper"] = "laptop",
+    parts: tuple[Literal["probe", "vae", "mdn_rnn"], ...] = (),
+    dataset: Path | None = None,
+) -> None:
+    """Measure the shipped V and M, and what they are compared with, on unseen episodes.
+
+    What they are compared with is trained first, which takes an hour or two. Stop it when you like;
+    the same command continues.
+
+    Args:
+        out: Folder for what is trained, and for latents.json.
+        preset: Of what is trained.
+        parts: What to measure; all if not given.
+        dataset: Folder of the dataset; OUT/dataset if not given.
+    """
+    from stad_study.latents import PARTS, measure
+
+    folder = output(out)
+    measure(
+        Config.preset(preset), dataset or folder / "dataset", folder, list(parts) or list(PARTS)
+    )
+    print(f"every measurement: {folder / 'latents.json'}")
+
+
+def benchmark(
+    parts: tuple[str, ...] = (),
+    rounds: int = 5,
+    json: Path = Path("benchmark.json"),
+    add: bool = False,
+) -> None:
+    """Measure speeds side by side with Gymnasium and EnvPool, on a machine that does nothing else.
+
+    Args:
+        parts: Some of parity, renderer, loop, training, run; all if not given.
+        rounds: How often the contenders take turns.
+        json: Where to write every measurement.
+        add: Put them into the tables, too, in place of the same parts.
+    """
+    from stad_lab.evaluation.evaluate import check_output
+    from stad_study.benchmark import PARTS, benchmark
+    from stad_study.tables import add_speed
+
+    check_output(json)
+    benchmark(list(parts) or list(PARTS), rounds, json)
+    print(f"\nevery measurement: {json}")
+    if add:
+        add_speed(json)
+
+
+COMMANDS: dict[str, Callable] = {
+    "replicate": replicate,
+    "evaluate": evaluate,
+    "probe": probe,
+    "claims": claims,
+    "latents": latents,
+    "benchmark": benchmark,
+}
+CONTINUES = ("replicate", "probe", "latents")
+PROGRAM = command_line.Program(
+    "python -m stad_study", "Repeat what the replication ran.", COMMANDS, CONTINUES
+)

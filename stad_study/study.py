@@ -1,0 +1,408 @@
+"""Runs a study of docs/protocol.md: whole pipelines, seed by seed, each added to the tables.
+
+A pipeline is named by its seed, its variant and what C sees, for example `seed0/frame/z`. In the
+folder of a study::
+
+    seed0/dataset/              of the random driver, for all pipelines of the seed
+    seed0/frame/                V and M, for both controllers
+    seed0/frame/z/              C that sees z, with the log of CMA-ES and the episodes of the score
+    networks/seed0/frame/...    what is kept of them, see `stad_study.networks`
+
+Whatever is there is not done again. A variant of a seed whose pipelines are in the tables is not
+run, unless one is asked for by its name: then it is compared with what the tables say.
+"""
+
+import contextlib
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas
+import torch
+from threadpoolctl import threadpool_limits
+
+from stad_lab.agent import Agent
+from stad_lab.config import STUDY_TRACKS, VARIANTS, Config
+from stad_lab.evaluation.evaluate import report
+from stad_lab.io.files import (
+    checksum,
+    checksum_of_arrays,
+    copy_file,
+    load_json,
+    locked,
+    save_json,
+)
+from stad_lab.io.weights import load_world_model
+from stad_lab.io.workers import run_in_order, worker_threads
+from stad_lab.training.dataset import MANIFEST, dataset_checksum, load_manifest
+from stad_lab.training.evolution import LOG, drive_group, hand_out, read_log, resume
+from stad_lab.training.pipeline import train
+from stad_lab.training.record import RECORD
+from stad_study import tables
+from stad_study.networks import (
+    NETWORKS,
+    WORLD_MODEL_FILE,
+    how_to_get,
+    keep_controller,
+    keep_world_model,
+    load_kept_agent,
+)
+from stad_study.run import share_world_model
+from stad_study.tables import PIPELINE
+
+SCORE = "score.json"
+CARS = 16  # cars that drive in one batch: another number would change last bits of the returns
+THREADS = 1  # that train V and M, on every machine: last bits depend on their number
+WAIT = 120.0  # seconds to wait for another process that writes the tables
+COLLECTING = 3600.0  # seconds to wait for another process that collects the dataset
+STAGES = ("dataset", "vae", "mdn_rnn", "controller", "score")
+MADE_WITH = ("commit", "processor", "threads", "torch", "trained_on")  # that is noted of V and M
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is run, and how each pipeline is scored."""
+
+    about: str
+    seeds: Sequence[int]
+    variants: tuple[str, ...] = VARIANTS
+    features: tuple[str, ...] = ("z", "z, h")  # what C sees
+    config: Config = field(default_factory=lambda: Config.preset("laptop"))
+    tracks: range = STUDY_TRACKS
+    max_frames: int = 1000  # of an episode of the score, which has no patience
+
+
+STUDIES = {
+    "study1": Study("Do difference images earn points?", range(12)),
+    "pilot": Study("a seed outside study1", (100,), ("frame", "input_output")),
+}
+
+
+class Pipeline(NamedTuple):
+    """One whole training of V, M and C; its name is also its folder."""
+
+    study: str
+    variant: str
+    features: str
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """For example "seed0/frame/z_h"."""
+        return f"seed{self.seed}/{self.variant}/{self.features.replace(', ', '_')}"
+
+    @property
+    def config(self) -> Config:
+        """Its configuration. Dataset, tracks and candidates depend on the seed alone."""
+        evolution = {"seed": self.seed, "features": self.features}
+        own = {"variant": self.variant, "seed": self.seed, "evolution": evolution}
+        return STUDIES[self.study].config.replace(**own)
+
+
+def find_pipelines(
+    study: str, seeds: Sequence[int] | None = None, only: Sequence[str] | None = None
+) -> list[Pipeline]:
+    """The pipelines of a study in the order of running: all, of some seeds, or some by name.
+
+    ValueError for an unknown study, seed or name.
+    """
+    if study not in STUDIES:
+        raise ValueError(f"unknown study {study!r}: choose one of {', '.join(STUDIES)}")
+    asked = STUDIES[study]
+    if other := set(seeds or ()) - set(asked.seeds):
+        known = f"{min(asked.seeds)} to {max(asked.seeds)}"
+        raise ValueError(f"study {study!r} has no seed {min(other)}: it has {known}")
+    chosen = [seed for seed in asked.seeds if not seeds or seed in seeds]
+    arms = [(variant, features) for variant in asked.variants for features in asked.features]
+    found = [Pipeline(study, *arm, seed) for seed in chosen for arm in arms]
+    names = [pipeline.name for pipeline in found]
+    if unknown := [name for name in only or [] if name not in names]:
+        example = f"expected a name such as {names[0]!r}"
+        raise ValueError(f"study {study!r} has no pipeline {unknown[0]!r}: {example}")
+    return [pipeline for pipeline in found if not only or pipeline.name in only]
+
+
+def run_study(
+    study: str,
+    folder: str | Path,
+    executor: Executor | None = None,
+    seeds: Sequence[int] | None = None,
+    only: Sequence[str] | None = None,
+    to: Path = tables.DATA,
+) -> None:
+    """Run the missing pipelines of a study in `folder/study`, and add each to the tables in `to`.
+
+    After an interruption the same call continues. A variant of a seed that another process runs is
+    left to it, so several processes may run a study in the same folder. With `only`, pipelines that
+    the tables have are run, too, and compared with the tables instead of added.
+
+    Raises ValueError as `find_pipelines`, and for a folder with a recorded pipeline that `only`
+    names; and what `train` raises.
+    """
+    wanted, root = find_pipelines(study, seeds, only), Path(folder) / study
+    for pipeline in wanted if only else ():
+        if (root / pipeline.name / SCORE).exists() and recorded(pipeline, to):
+            remedy = "give an empty folder with --out to repeat it"
+            raise ValueError(f"{root / pipeline.name} is the recorded pipeline: {remedy}")
+    for seed, variant in dict.fromkeys((one.seed, one.variant) for one in wanted):
+        own = [one for one in wanted if (one.seed, one.variant) == (seed, variant)]
+        if not only and not unfinished(own, to):
+            continue
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(locked(root / f"seed{seed}" / variant))
+            except BlockingIOError:
+                print(f"seed{seed}/{variant}: is run by another process", flush=True)
+                continue
+            # Asked again, because another process may have finished them just before.
+            for pipeline in own if only else unfinished(own, to):
+                print(f"{pipeline.name}: {describe_progress(study, wanted, to)}", flush=True)
+                run_pipeline(pipeline, root, executor)
+                if only and recorded(pipeline, to):
+                    found = compare(pipeline, root, to)
+                else:
+                    add_pipeline(pipeline, root, to)
+                    found = describe_score(pipeline, root)
+                print(f"{pipeline.name}: {found}", flush=True)
+    print(f"{study}: {describe_progress(study, wanted, to)}")
+
+
+def unfinished(pipelines: list[Pipeline], to: Path) -> list[Pipeline]:
+    """The pipelines of one variant and seed that are to be run: all, if one is not in the tables.
+
+    They share V and M, which come out otherwise on another kind of processor. Those whose score is
+    in the folder are only added again.
+    """
+    lacking = any(recorded(one, to) is None for one in pipelines)
+    return pipelines if lacking else []
+
+
+def run_pipeline(pipeline: Pipeline, root: Path, executor: Executor | None) -> None:
+    """Do what is missing of a pipeline: dataset, V, M, C, what is kept of them, and the score."""
+    config, run = pipeline.config, root / pipeline.name
+    seed, world = root / f"seed{pipeline.seed}", run.parent
+    if (run / SCORE).exists():
+        return
+    with fixed_threads():
+        usual = STUDIES[pipeline.study].config
+        shared = config.replace(evolution={"features": usual.evolution.features})
+        with locked(seed, COLLECTING):
+            train(shared.replace(variant=usual.variant), seed, until="dataset", executor=executor)
+        train(shared, world, seed / "dataset", until="mdn_rnn", executor=executor)
+        share_world_model(config, run, world)
+        train(config, run, seed / "dataset", executor=executor)
+        kept = keep(pipeline, root)
+        begin, tracks = time.perf_counter(), STUDIES[pipeline.study].tracks
+        limits = {"max_frames": STUDIES[pipeline.study].max_frames}
+        agent = load_kept_agent(kept)
+        score = drive_tracks(agent, tracks, config.processes, executor, pipeline.name, limits)
+        controller = checksum_of_arrays(parameters=agent.parameters)
+        found = {"kind": "score", "variant": pipeline.variant, "controller": controller} | score
+        save_json(run / SCORE, found | {"seconds": time.perf_counter() - begin})
+
+
+@contextlib.contextmanager
+def fixed_threads() -> Iterator[None]:
+    """Let PyTorch and BLAS compute on THREADS threads, whatever the number of cores."""
+    before = torch.get_num_threads()
+    with threadpool_limits(THREADS):
+        torch.set_num_threads(THREADS)
+        try:
+            yield
+        finally:
+            torch.set_num_threads(before)
+
+
+def keep(pipeline: Pipeline, root: Path) -> Path:
+    """Write what is kept of a finished pipeline; returns the file of its controller."""
+    run, config = root / pipeline.name, pipeline.config
+    path = kept_file(pipeline, root / "networks")
+    keep_world_model(config, run, path.with_name(WORLD_MODEL_FILE))
+    trained = load_world_model(run).checksums
+    keep_controller(path, final_controller(config, run), pipeline.variant, trained)
+    return path
+
+
+def kept_file(pipeline: Pipeline, networks: Path) -> Path:
+    """The file of a kept controller."""
+    return networks / f"{pipeline.name}.safetensors"
+
+
+def final_controller(config: Config, run: Path) -> np.ndarray:
+    """The averaged CMA mean after the last generation, float64 (parameters,).
+
+    It is the outcome of a study. The C that `train` writes is the averaged mean of the generation
+    with the best validation, whose score has the noise of that choice.
+    """
+    world_model = load_world_model(run)
+    log = read_log(config, run, world_model)
+    if len(log["generations"]) < config.evolution.generations:
+        raise ValueError(f"{run} has {len(log['generations'])} generations: run it to the end")
+    return resume(config, run, world_model, log).controller()
+
+
+def drive_tracks(
+    agent: Agent,
+    tracks: Sequence[int],
+    processes: int = 2,
+    executor: Executor | None = None,
+    label: str = "",
+    limits: dict | None = None,
+) -> dict:
+    """Drive an agent on tracks in groups of CARS, with the fast renderer; as `report` returns it.
+
+    Groups begin with the first track, so the same first track gives bit-identical returns.
+    """
+    tracks = list(tracks)
+    groups = [tracks[start : start + CARS] for start in range(0, len(tracks), CARS)]
+    with worker_threads(processes, executor) as executor:
+        source = hand_out(executor, agent.world_model)
+        tasks = [(source, agent.parameters, group, True, limits) for group in groups]
+        found = run_in_order(executor, drive_group, tasks, f"score {label}", "group")
+    returns, lengths = (np.concatenate(part) for part in zip(*found, strict=True))
+    return report(tracks, returns, lengths)
+
+
+def recorded(pipeline: Pipeline, to: Path = tables.DATA) -> dict | None:
+    """The line of a pipeline in the table of runs; None if it is not there."""
+    table = tables.read_study("runs", to)
+    own = table[(table[PIPELINE] == list(pipeline)).all(axis=1)]
+    return own.iloc[0].to_dict() if len(own) else None
+
+
+def add_pipeline(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> None:
+    """Add a finished pipeline to the tables in `to`, and its networks to the folder beside them.
+
+    The line of runs comes last: a pipeline that has one is complete. Processes take turns.
+    """
+    run, key = root / pipeline.name, pipeline._asdict()
+    networks = to.parent / NETWORKS.name / pipeline.study
+    log, score = load_json(run / LOG), load_json(run / SCORE, kind="score")
+    kept = kept_file(pipeline, root / "networks")
+    with locked(networks, WAIT):
+        for file in (kept.with_name(WORLD_MODEL_FILE), kept):
+            copy_file(file, kept_file(pipeline, networks).parent)
+        driven = pandas.DataFrame(score["episodes"]).rename(columns={"frames": "length"})
+        generations = describe_generations(log["generations"], load_json(seed_record(run)))
+        line = pandas.DataFrame([describe_run(pipeline, root)])
+        for name, lines in (("episodes", driven), ("generations", generations), ("runs", line)):
+            tables.replace_lines(f"study_{name}", lines.assign(**key), to)
+
+
+def seed_record(run: Path) -> Path:
+    """The record of the dataset of a pipeline."""
+    return run.parent.parent / RECORD
+
+
+def describe_generations(generations: list[dict], seed: dict) -> pandas.DataFrame:
+    """The lines of a CMA-ES run: fitness, validation, and all that was driven so far.
+
+    "episodes" and "frames" count the dataset, the candidates and the validations.
+    """
+    lines, driven = [], dict(seed["budget"]["random"])
+    for entry in generations:
+        fitness, validation = np.mean(entry["returns"], axis=1), entry.get("validation", {})
+        driven["episodes"] += np.size(entry["returns"]) + len(validation.get("returns", ()))
+        driven["frames"] += entry["frames"] + validation.get("frames", 0)
+        line = {"worst": fitness.min(), "mean": fitness.mean(), "best": fitness.max()}
+        line |= {"sigma": entry["sigma"], "validation": validation.get("mean"), **driven}
+        lines.append({"generation": entry["generation"], **line})
+    return pandas.DataFrame(lines)
+
+
+def describe_run(pipeline: Pipeline, root: Path) -> dict:
+    """The line of runs: settings, machine, seconds of each stage, budget and checksums.
+
+    The seconds of the dataset are those of the seed, and those of V and M of the variant: other
+    pipelines share them, and repeat them in their own lines.
+    """
+    run = root / pipeline.name
+    shared = {"vae": run.parent / RECORD, "mdn_rnn": run.parent / RECORD}
+    shared["dataset"], kept = seed_record(run), kept_file(pipeline, root / "networks")
+    line = tables.describe_record(load_json(run / RECORD))
+    for stage, file in shared.items():
+        line[f"seconds.{stage}"] = load_json(file)["seconds"].get(stage, 0.0)
+    made_with = load_json(run.parent / RECORD)["made_with"]
+    line |= {f"world_model.{name}": made_with[name] for name in MADE_WITH}
+    score = load_json(run / SCORE, kind="score")
+    frames = sum(episode["frames"] for episode in score["episodes"])
+    line |= {"seconds.score": score["seconds"], "budget.score.frames": frames}
+    line |= {"budget.score.episodes": len(score["episodes"])}
+    manifest = load_manifest(root / f"seed{pipeline.seed}" / "dataset" / MANIFEST)
+    line |= {"dataset": dataset_checksum(manifest), **load_world_model(run).checksums}
+    line["log"] = checksum((run / LOG).read_bytes())
+    line["kept_world_model"] = checksum(kept.with_name(WORLD_MODEL_FILE).read_bytes())
+    return line | {"kept_controller": checksum(kept.read_bytes())} | pipeline._asdict()
+
+
+CHECKSUMS = ("dataset", "vae", "mdn_rnn", "log", "kept_world_model", "kept_controller")
+
+
+def compare(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> str:
+    """Whether a pipeline that was run again is, bit by bit, the one in the tables."""
+    was, now = recorded(pipeline, to) or {}, describe_run(pipeline, root)
+    table = tables.read_study("episodes", to)
+    before = table[(table[PIPELINE] == list(pipeline)).all(axis=1)].set_index("track")["return"]
+    score = load_json(root / pipeline.name / SCORE, kind="score")
+    again = {episode["track"]: episode["return"] for episode in score["episodes"]}
+    other = sum(before[track] != value for track, value in again.items())
+    differs = [name for name in CHECKSUMS if was[name] != now[name]]
+    if not differs and not other:
+        return f"bit-identical to the recorded one, all {len(again)} returns, too"
+    made = [
+        f"{line['processor']}, V and M on {line['world_model.trained_on']} with PyTorch"
+        f" {line['world_model.torch']}"
+        for line in (was, now)
+    ]
+    found = f"differs in {', '.join(differs)} and {other} of {len(again)} returns"
+    return f"{found}; recorded on {made[0]}, here {made[1]}"
+
+
+def describe_score(pipeline: Pipeline, root: Path) -> str:
+    """One line on a finished pipeline."""
+    score = load_json(root / pipeline.name / SCORE, kind="score")
+    return f"mean return {score['mean']:.1f} on {len(score['episodes'])} tracks"
+
+
+def describe_progress(study: str, wanted: list[Pipeline], to: Path = tables.DATA) -> str:
+    """How many pipelines are in the tables, and about how long the others will take."""
+    table = tables.read_study("runs", to)
+    done = {Pipeline(*line) for line in table[PIPELINE].itertuples(index=False)}
+    missing = [pipeline for pipeline in wanted if pipeline not in done]
+    text = f"{len(wanted) - len(missing)} of {len(wanted)} pipelines are done"
+    if not missing or table.empty:
+        return text
+    own = table[table["study"] == study]
+    seconds = (own if len(own) else table)[[f"seconds.{stage}" for stage in STAGES]].mean()
+    trained = {(one.seed, one.variant) for one in done if one.study == study}
+    worlds = {(one.seed, one.variant) for one in missing} - trained
+    datasets = {seed for seed, _ in worlds} - {seed for seed, _ in trained}
+    counts = [len(datasets), len(worlds), len(worlds), len(missing), len(missing)]
+    return f"{text}, about {np.dot(counts, seconds) / 3600:.1f} hours are left"
+
+
+def evaluate_kept(
+    study: str,
+    tracks: Sequence[int],
+    seeds: Sequence[int] | None = None,
+    only: Sequence[str] | None = None,
+    networks: Path = NETWORKS,
+    executor: Executor | None = None,
+) -> Iterator[tuple[Pipeline, dict]]:
+    """Drive the kept agents of a study on any tracks, at least 0; yields what `report` returns.
+
+    FileNotFoundError if an agent that is asked for by name is not there, or if none is.
+    """
+    wanted, folder = find_pipelines(study, seeds, only), networks / study
+    there = [one for one in wanted if kept_file(one, folder).exists()]
+    if not there or (only and len(there) < len(wanted)):
+        raise FileNotFoundError(f"{folder} has no agents of these names: {how_to_get(study)}")
+    if others := len(wanted) - len(there):
+        print(f"{others} agents are not there: {how_to_get(study)}", flush=True)
+    for pipeline in there:
+        agent = load_kept_agent(kept_file(pipeline, folder))
+        yield pipeline, drive_tracks(agent, tracks, 2, executor, pipeline.name)

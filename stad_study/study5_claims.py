@@ -1,0 +1,97 @@
+"""The statistics of study 5 that docs/protocol.md fixes, computed from its tables.
+
+The score of a seed is the mean of its three runs. Before the last run of a part is in the tables,
+only the progress is reported: nothing is tested earlier.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stad_lab.evaluation import statistics
+from stad_study import tables
+from stad_study.study5 import ARMS, REPEATS, find_runs
+from stad_study.study_claims import compare, find_verdict
+
+Families = dict[tuple[str, ...], dict[str, tuple[dict[str, float], ...]]]
+
+FAMILIES: Families = {  # the parts that must be complete -> comparison -> arms added and subtracted
+    ("5a",): {
+        "interaction": (
+            {"input_output: z": 1, "frame: z, h": 1},
+            {"frame: z": 1, "input_output: z, h": 1},
+        ),
+        "input_output less input": (
+            {"input_output: z": 0.5, "input_output: z, h": 0.5},
+            {"input: z": 0.5, "input: z, h": 0.5},
+        ),
+    },
+    ("5b", "5c"): {
+        "adding motion": ({"frame: z + motion": 1}, {"frame: z + placebo": 1}),
+        "erasing motion": ({"input_output: z - motion": 1}, {"input_output: z - placebo": 1}),
+    },
+}
+DESCRIBED: Families = {  # without a test
+    ("5c",): {
+        "both with motion": ({"input_output: z + motion": 1}, {"frame: z + motion": 1}),
+        "remembering the action": ({"frame: z + action": 1}, {"frame: z + placebo": 1}),
+    },
+}
+
+
+def describe_study5(folder: Path = tables.DATA) -> dict:
+    """Progress by part; and for complete parts "arms" and "comparisons".
+
+    An arm is named by variant and what C sees: "frame: z + motion".
+    """
+    table = tables.read_or_empty("study5_runs", folder)
+    done = set(table[tables.SENSED].itertuples(index=False, name=None))
+    planned = {part: find_runs(parts=[part]) for part in ARMS}
+    counts = {part: sum(tuple(run) in done for run in runs) for part, runs in planned.items()}
+    found: dict[str, Any] = {
+        "runs": counts,
+        "planned": {part: len(runs) for part, runs in planned.items()},
+    }
+    complete = [part for part in ARMS if counts[part] == len(planned[part])]
+    scores = scores_of(complete, folder)
+    found["arms"] = {arm: describe_arm(own) for arm, own in scores.items()}
+    found["comparisons"] = {}
+    for families, tested in ((FAMILIES, True), (DESCRIBED, False)):
+        for parts, comparisons in families.items():
+            if set(parts) <= set(complete):
+                found["comparisons"] |= compare_family(scores, comparisons, tested)
+    return found
+
+
+def scores_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndarray]:
+    """Arm -> returns (seeds, tracks), averaged over the runs of each seed."""
+    if not parts:
+        return {}
+    table = tables.read("study5_returns", folder).set_index(tables.SENSED)
+    table, found = table[[column for column in table if column.isdigit()]], {}
+    for variant, sees in (arm for part in parts for arm in ARMS[part]):
+        seeds = dict.fromkeys(run.seed for run in find_runs(parts=parts))
+        runs = [[table.loc[(seed, variant, sees, n)] for n in REPEATS] for seed in seeds]
+        found[f"{variant}: {sees}"] = np.mean(runs, axis=1)
+    return found
+
+
+def describe_arm(returns: np.ndarray) -> dict:
+    """The score of an arm, and of each seed, from returns (seeds, tracks)."""
+    return {"mean": float(returns.mean()), "by_seed": returns.mean(axis=1).tolist()}
+
+
+def compare_family(scores: dict[str, np.ndarray], comparisons: dict, tested: bool) -> dict:
+    """Comparison -> difference with interval; where `tested` Holm's p over all, and a verdict."""
+    found = {}
+    for name, sides in comparisons.items():
+        added, subtracted = (
+            sum(weight * scores[arm] for arm, weight in side.items()) for side in sides
+        )
+        found[name] = compare(subtracted, added)
+    if tested:
+        adjusted = statistics.holm([one["p"] for one in found.values()])
+        for one, p in zip(found.values(), adjusted, strict=True):
+            one |= {"holm_p": p, "verdict": find_verdict(one["interval"], p)}
+    return found

@@ -1,0 +1,113 @@
+"""The competition: a submission costs itself alone, and a ranking can be continued and checked."""
+
+import json
+
+import numpy as np
+import pytest
+from course.submissions import CHEATS, MISBEHAVE, write_class
+
+from stad_course.cli import main
+from stad_course.compete.drive import MOST_FAILURES, STARTER, check_submission
+from stad_course.compete.limits import Limits
+from stad_course.compete.process import Submission, can_isolate
+from stad_course.compete.ranking import rank
+from stad_course.compete.tracks import hide_tracks
+from stad_lab.io.files import load_json
+
+SHORT = ("--limits.start", "20", "--limits.step", "0.5")
+HARMLESS = {"kills_itself"} if can_isolate() else set()  # the first process of a namespace cannot
+
+
+def hold(folder, good, misbehaving, tracks, *options):
+    """Run a competition by its command, and return the results by name."""
+    write_class(folder / "class", good, misbehaving)
+    secret, out = str(folder / "tracks.json"), str(folder / "out")
+    assert main(["commit", secret, "--tracks", str(tracks)]) == 0
+    submissions = str(folder / "class")
+    assert main(["compete", submissions, "--out", out, "--secret", secret, *options]) == 0
+    return {file.stem: load_json(file) for file in (folder / "out" / "results").iterdir()}
+
+
+@pytest.fixture(scope="module")
+def held(tmp_path_factory):
+    """A small competition: its folder, and its results."""
+    folder = tmp_path_factory.mktemp("competition")
+    return folder, hold(folder, 1, ("crash", "nan"), 2, *SHORT, "--no-baselines")
+
+
+def test_a_submission_that_breaks_down_costs_itself_alone_and_its_author_reads_why(held):
+    _, results = held
+    for name in ("crash", "nan"):
+        assert results[name]["returns"] == [-100, -100]
+        assert MISBEHAVE[name][2] in results[name]["failures"][0]
+    assert results["student00"]["failures"] == [] and min(results["student00"]["returns"]) > 0
+
+
+def test_what_a_child_prints_or_patches_changes_no_score(held):
+    _, results = held
+    for name in CHEATS:
+        assert results[name]["failures"] == [] and max(results[name]["returns"]) < 900
+
+
+def test_a_competition_continues_with_the_same_ranking(held):
+    folder, results = held
+    (folder / "out" / "results" / "student00.json").unlink()
+    again = hold(folder, 1, ("crash", "nan"), 2, *SHORT, "--no-baselines")
+    assert {name: one["returns"] for name, one in again.items()} == {
+        name: one["returns"] for name, one in results.items()
+    }
+
+
+def test_the_hash_is_known_before_the_seeds_and_the_page_holds_both_only_afterwards(held, capsys):
+    folder, _ = held
+    page, secret = folder / "out" / "leaderboard.html", folder / "tracks.json"
+    told = json.loads(secret.read_text(encoding="utf-8"))
+    assert hide_tracks(secret, 2) in page.read_text(encoding="utf-8")
+    assert str(told["tracks"][0]) not in page.read_text(encoding="utf-8")
+    hold(folder, 1, ("crash", "nan"), 2, *SHORT, "--no-baselines", "--reveal")
+    assert str(told["tracks"][0]) in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not can_isolate(), reason="this system starts no process in namespaces")
+def test_a_submission_sees_neither_hidden_tracks_nor_other_processes_and_writes_nowhere(tmp_path):
+    secret, file = tmp_path / "tracks.json", tmp_path / "spy.py"
+    hide_tracks(secret, 2)
+    file.write_text(
+        "import pathlib\n"
+        f"assert not pathlib.Path({str(secret)!r}).read_bytes(), 'saw the tracks'\n"
+        "assert len([p for p in pathlib.Path('/proc').iterdir() if p.name.isdigit()]) < 5\n"
+        "for place in (pathlib.Path('/etc'), pathlib.Path(__import__('stad_lab').__path__[0])):\n"
+        "    try:\n        (place / 'spy').touch()\n"
+        "    except OSError:\n        continue\n"
+        "    raise AssertionError(f'wrote to {place}')\n"
+        "class Agent:\n    def act(self, observation): return [0, 0, 0]\n"
+        "make_agent = Agent\n"
+    )
+    with Submission(file, Limits(), hidden=(secret,)) as driver:
+        driver.reset()
+        assert driver.act_batch(np.zeros((1, 96, 96, 3), np.uint8)).tolist() == [[0, 0, 0]]
+
+
+def test_the_kit_passes_its_own_check():
+    assert check_submission(STARTER / "my_agent.py", Limits(), tracks=(0,)).startswith("ok")
+
+
+def test_only_those_are_tied_with_the_first_who_are_not_significantly_behind():
+    rng = np.random.default_rng(0)
+    best = 900 + rng.normal(0, 10, 30)
+    others = {"best": best, "near": best - rng.normal(0, 10, 30), "far": best - 100}
+    table = rank([{"name": name, "returns": own.tolist()} for name, own in others.items()])
+    tied = dict(zip(table["name"], table["tied"], strict=True))
+    assert tied["best"] and tied["near"] and not tied["far"]
+
+
+@pytest.mark.long
+def test_sixty_submissions_of_which_fifteen_misbehave_on_fifty_tracks(tmp_path):
+    good = 60 - len(MISBEHAVE) - len(CHEATS)
+    results = hold(tmp_path, good, tuple(MISBEHAVE), 50)
+    assert len(results) == 60 + 6
+    for name, (_, _, said) in MISBEHAVE.items():
+        if name not in HARMLESS:
+            assert said in results[name]["failures"][0], name
+            assert len(results[name]["failures"]) <= MOST_FAILURES
+    assert all(not one["failures"] for name, one in results.items() if name not in MISBEHAVE)

@@ -1,0 +1,50 @@
+"""The statistics of study 5: nothing is tested before a part is complete, and effects are found."""
+
+import numpy as np
+import pandas
+import pytest
+
+from stad_study import tables
+from stad_study.study5 import find_runs
+from stad_study.study5_claims import describe_study5
+
+EFFECTS = {"z + motion": 40, "z - motion": -40}  # points
+
+
+def write_tables(folder, runs):
+    """Tables in which motion earns 40 points, and input_output another 20."""
+    rng, lines = np.random.default_rng(0), []
+    for run in runs:
+        mean = 800 + EFFECTS.get(run.sees, 0) + 20 * (run.variant == "input_output")
+        returns = mean + rng.normal(0, 5) + rng.normal(0, 20, 40)
+        columns = {str(1000 + track): one for track, one in enumerate(returns)}
+        lines.append((run._asdict(), columns | {"mean": returns.mean()}))
+    made = {"processor": "a CPU", "controller": "c"}
+    for name in ("runs", "returns"):
+        table = pandas.DataFrame([key | found | made for key, found in lines])
+        tables.save(f"study5_{name}", table, folder)
+
+
+def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
+    assert describe_study5(tmp_path)["runs"] == {"5a": 0, "5b": 0, "5c": 0}
+    write_tables(tmp_path, find_runs()[:-1])
+    found = describe_study5(tmp_path)
+    assert found["runs"] == {"5a": 216, "5b": 72, "5c": 143}
+    assert set(found["comparisons"]) == {"interaction", "input_output less input"}
+    assert "frame: z + motion" not in found["arms"] and "frame: z" in found["arms"]
+
+
+def test_effects_are_found_and_corrected_within_their_family(tmp_path):
+    write_tables(tmp_path, find_runs())
+    found = describe_study5(tmp_path)["comparisons"]
+    expected = {"interaction": 0, "input_output less input": 20, "both with motion": 20}
+    expected |= {"adding motion": 40, "erasing motion": -40, "remembering the action": 0}
+    for name, points in expected.items():
+        assert found[name]["difference"] == pytest.approx(points, abs=8), name
+        assert len(found[name]["by_seed"]) == 12
+    assert found["adding motion"]["verdict"] == "gain"
+    assert found["erasing motion"]["verdict"] == "harm"
+    pair = [found[name] for name in ("interaction", "input_output less input")]
+    low, high = sorted(pair, key=lambda one: one["p"])
+    assert low["holm_p"] == pytest.approx(2 * low["p"]) and high["holm_p"] >= high["p"]
+    assert "verdict" not in found["both with motion"]
