@@ -12,7 +12,7 @@ stad.start(async () => {
   const crew = await stad.Crew.start();
   const view = new stad.EvolveView();
   // `log` is all that has to be kept: `states`, one more than generations, follow from it.
-  let [settings, log, states, bet] = [null, [], [], 8];
+  let [settings, log, states, bet] = [null, [], [], null];
   let upcoming = null; // what CMA-ES has asked for, and nobody has driven yet
   let finished = null; // the candidates that have driven last, and where they came from
   let [wanted, run] = [0, 0]; // generations to drive; a number for each fresh start
@@ -79,7 +79,7 @@ stad.start(async () => {
     const next = await crew.lead("ask");
     const track = await crew.lead("track", { seed: next.tracks[0] });
     if (own !== run) return;
-    [log, states, upcoming, finished] = [kept, found, next, null];
+    [log, states, upcoming, finished, saved] = [kept, found, next, null, 0];
     view.begin(track, settings.population + 1, "");
     stad.evolveSettings.show(settings);
     show();
@@ -115,7 +115,8 @@ stad.start(async () => {
   function showButtons() {
     const begun = log.length > 0 || driving !== null;
     get("run").textContent = driving && paused === null ? "Pause" : begun ? "Go on" : "Start";
-    get("bet-value").textContent = get("bet").value = bet;
+    get("bet-value").textContent = bet ?? "?";
+    get("bet").value = bet ?? 1;
     get("bet").disabled = begun;
     get("download").disabled = get("race").hidden = log.length === 0;
     const { seed, agent } = settings;
@@ -154,7 +155,9 @@ stad.start(async () => {
     showButtons();
   }
 
+  let saved = 0; // generations of the driver that was downloaded last
   async function download() {
+    saved = log.length;
     const parameters = stad.expandController(states.at(-1).mean, Z, H);
     const facts = { ...identity, generation: log.length, seed: settings.seed };
     const link = document.createElement("a");
@@ -172,13 +175,17 @@ stad.start(async () => {
   // A driver that took minutes is not thrown away by one click.
   get("restart").addEventListener("click", () => {
     const wrong = stad.evolveSettings.wrong();
-    const sure = log.length === 0 || get("restart").dataset.asked === "true";
+    const sure = log.length === saved || get("restart").dataset.asked === "true";
     get("warning").textContent =
       wrong ??
       (sure ? "" : `This ends your driver of generation ${log.length}. Download it first?`);
     ask(!wrong && !sure);
     if (!wrong && sure) restart(stad.evolveSettings.fromControls()).catch(stad.fail);
   });
+  for (const name of stad.evolveSettings.NAMES)
+    get(name).addEventListener("change", () => {
+      get("warning").textContent = "It will hold after a fresh start.";
+    });
   get("restart").addEventListener("blur", () => {
     get("warning").textContent = "";
     ask(false);
@@ -200,11 +207,13 @@ stad.start(async () => {
       restart(asked).catch(stad.fail);
   });
 
+  const asked = location.hash;
   const kept = stad.evolveSettings.kept();
   const first = kept?.settings ?? stad.evolveSettings.fromAddress();
   bet = kept?.bet ?? bet;
   try {
     await restart(first, kept?.log);
+    get("answer").textContent ||= stad.evolveSettings.ignored(asked);
   } catch (error) {
     await restart(first);
     get("answer").textContent = error.message;

@@ -25,6 +25,17 @@ stad.evolveSettings = {
     return this.parse(new Map(this.NAMES.map((name) => [name, stad.get(name).value])));
   },
 
+  /** What an address asks for in vain; "" if there is nothing. */
+  ignored(hash) {
+    const asked = new URLSearchParams(hash.slice(1));
+    const found = this.parse(asked);
+    const vain = this.NAMES.filter(
+      (name) => asked.has(name) && asked.get(name) !== `${found[name]}`,
+    );
+    const told = vain.map((name) => `${name}=${asked.get(name)}`);
+    return told.length ? `The address asks for what does not exist: ${told.join(", ")}.` : "";
+  },
+
   /** What is wrong with the seed, the one setting that is typed; null if nothing is. */
   wrong() {
     const { value } = stad.get("seed");

@@ -109,7 +109,7 @@ stad.start(async () => {
     const shown = state.phase === "attract" ? cars.rival : cars.you;
     const scale = height / VIEW;
     context.save();
-    context.fillStyle = "#5fae57";
+    context.fillStyle = "#333"; // beyond the field
     context.fillRect(0, 0, width, height);
     context.translate(width / 2, height * 0.72);
     context.scale(scale, -scale);
@@ -149,8 +149,7 @@ stad.start(async () => {
       context.fillStyle = steers.has(side) ? "#fff" : "#fff9";
       context.fillText(sign, x, height / 2);
     }
-    if (state.you.frames < 4 * stad.FRAMES_A_SECOND && !steers.size)
-      drawHint(context, width, height);
+    if (!touched) drawHint(context, width, height);
   }
 
   /** What a finger does, until it has done it. */
@@ -167,10 +166,13 @@ stad.start(async () => {
 
   function drawGrass(context, { x, y }, wide) {
     const [square, reach] = [FIELD / 10, Math.max(VIEW, wide)];
+    context.fillStyle = "#5fae57";
+    context.fillRect(-FIELD, -FIELD, 2 * FIELD, 2 * FIELD);
     context.fillStyle = "#56a44e";
-    const first = (value) => Math.floor((value - reach) / (2 * square)) * 2 * square;
-    for (let left = first(x); left < x + reach; left += 2 * square)
-      for (let low = first(y); low < y + reach; low += 2 * square)
+    const within = (value) => Math.max(-FIELD, Math.min(FIELD, value));
+    const first = (value) => Math.floor(within(value - reach) / (2 * square)) * 2 * square;
+    for (let left = first(x); left < within(x + reach); left += 2 * square)
+      for (let low = first(y); low < within(y + reach); low += 2 * square)
         context.fillRect(left, low, square, square);
   }
 
@@ -248,7 +250,9 @@ stad.start(async () => {
     context.fillStyle = "#fff";
     context.font = "600 17px system-ui, sans-serif";
     context.textAlign = "center";
-    context.fillText("The arrow leads back to the road.", width / 2, 0.3 * height);
+    const auto = get("auto").getAttribute("aria-pressed") === "true";
+    const told = auto ? "It has never learned to find back." : "The arrow leads back to the road.";
+    context.fillText(told, width / 2, 0.2 * height);
   }
 
   function drawMap(context, width, height, cars) {
@@ -337,14 +341,17 @@ stad.start(async () => {
     const { phase } = state;
     get("live").dataset.phase = phase;
     get("card").hidden = phase === "race";
-    get("dream").hidden = true;
     [get("again").hidden, get("share").hidden] = [phase === "attract", phase === "attract"];
     set("pause", phase === "paused" ? "Go on" : "Pause");
     get("pause").disabled = phase !== "race" && phase !== "paused";
     get("eyes").disabled = get("auto").disabled = phase !== "race";
     if (phase !== "race" && phase !== "paused") wake();
+    if (phase === "over") [endedAt, touched] = [performance.now(), false];
+    if (phase === "over") setAuto(false);
+    set("share", "Copy the link");
     if (phase === "attract") showStart();
-    if (phase === "paused") showCard("Paused", "Press P or an arrow key to go on.");
+    const way = touching ? "Touch the picture" : "Press P or an arrow key";
+    if (phase === "paused") showCard("Paused", `${way} to go on.`);
     if (phase === "over") showEnd();
     if (phase === "race" && was === "attract") stad.announce("The race has begun.");
   }
@@ -356,7 +363,7 @@ stad.start(async () => {
 
   function showStart() {
     const title = `Beat the ${driver ? "evolved driver" : "agent"}`;
-    showCard(title, "Press an arrow key, or touch the picture, to race it.");
+    showCard(title, "You have 20 seconds. Press an arrow key, or touch the picture.");
   }
 
   function showEnd() {
@@ -367,7 +374,8 @@ stad.start(async () => {
     const ways = ["The time is up", "A whole lap", "You left the field"];
     const text =
       `${ways[you.ending]} after ${seconds(you.frames)} s: ${mine.toFixed(1)} points. ` +
-      `The agent's whole episode gives ${its.toFixed(1)}. ${recordOf(mine, helped)}`;
+      `The agent's lap gives ${its.toFixed(1)}. ${recordOf(mine, helped)} ` +
+      `${touching ? "Touch the picture" : "Press an arrow key"} to race again.`;
     showCard(title, text);
     stad.announce(`${title} ${text}`);
   }
@@ -379,7 +387,7 @@ stad.start(async () => {
       best[seed] = mine;
       keepBest();
     }
-    if (best[seed] === undefined) return "To have it counted, drive it yourself.";
+    if (best[seed] === undefined) return "Laps with the autopilot do not count.";
     return `Your best on this track: ${best[seed].toFixed(1)}${record ? ", just now" : ""}.`;
   }
 
@@ -460,20 +468,22 @@ stad.start(async () => {
 
   function sendPedals() {
     const pads = stad.readGamepad();
-    const auto = touching && !held.has("brake") ? ["gas"] : []; // gas by itself
+    const auto = touching && !held.has("brake") ? ["cruise"] : []; // gas by itself
     worker.postMessage({ type: "pedals", held: [...held.values(), ...auto], gamepad: pads });
   }
 
   /** A driver has touched a pedal: begin, or go on. */
   function wish() {
+    if (!seen) get("race").scrollIntoView({ block: "center" });
     if (state?.phase === "attract") begin();
     else if (state?.phase === "paused") setPaused(false);
+    else if (state?.phase === "over" && performance.now() - endedAt > 1500) begin(); // not by chance
   }
 
-  let touching = false;
+  let [touching, touched, endedAt] = [false, false, 0]; // a finger drives; has steered; when it ended
   const KEYS = {
     ArrowLeft: "left", ArrowRight: "right", ArrowUp: "gas", ArrowDown: "brake",
-    KeyA: "left", KeyD: "right", KeyW: "gas", KeyS: "brake",
+    KeyA: "left", KeyD: "right", KeyW: "gas", KeyS: "brake", Space: "brake",
   }; // prettier-ignore
 
   document.addEventListener("keydown", (event) => {
@@ -488,10 +498,11 @@ stad.start(async () => {
     const free = document.activeElement === document.body; // no other control wants the keys
     const idle = state?.phase === "attract" && seen && free;
     if (!racing && !idle) return;
-    if (event.key.toLowerCase() === "p" && !event.repeat) return setPaused(state.phase === "race");
+    if (event.key.toLowerCase() === "p" && !event.repeat)
+      return state.phase === "paused" ? wish() : setPaused(true);
     if (event.key.toLowerCase() === "e" && !event.repeat) return toggleEyes();
     const pedal = KEYS[event.code];
-    if (!pedal) return;
+    if (!pedal || (event.code === "Space" && event.target.matches("button"))) return;
     event.preventDefault();
     if (event.repeat) return;
     held.set(event.code, pedal);
@@ -533,6 +544,8 @@ stad.start(async () => {
     if (event.pointerType === "mouse" || state?.phase !== "race") return; // a click begins
     event.preventDefault();
     get("race").setPointerCapture(event.pointerId);
+    if (get("auto").getAttribute("aria-pressed") === "true") setAuto(false);
+    touched = true;
     steer(event);
   });
   get("race").addEventListener("pointermove", (event) => held.has(event.pointerId) && steer(event));

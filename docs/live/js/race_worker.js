@@ -51,6 +51,7 @@ stad.Race = class {
     this.phase = "waiting"; // "attract": the agent drives alone; "race"; "paused"; "over"
     this.resting = false; // no car drives before the race while nobody sees it
     this.steps = 0;
+    this.pedals = [];
   }
 
   async load({ code, facts, tables }) {
@@ -108,10 +109,19 @@ stad.Race = class {
     } else if (this.phase === "attract") return this.begin("attract");
     if (this.phase !== "race") return;
     you.see(this.random);
+    this.press(you.car.pose().speed);
     this.helped ||= you.autopilot;
     const action = you.autopilot ? undefined : this.hand.act();
     this.hand.action.set(you.drive(action));
     if (you.car.over) this.finish();
+  }
+
+  /** Pedals that are down; "cruise" is gas up to a speed, which is lower while a finger steers. */
+  press(speed) {
+    const steers = this.pedals.some((one) => one === "left" || one === "right");
+    const cruise = speed < (steers ? 35 : 55) ? "gas" : "none";
+    const down = this.pedals.map((one) => (one === "cruise" ? cruise : one));
+    this.hand.held = new Map(down.map((pedal, i) => [i, pedal]));
   }
 
   /** The reader's episode is over: the agent's is driven to its end at once. */
@@ -180,7 +190,7 @@ if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScop
     eyes: ({ closed }) => race.closeEyes(closed),
     autopilot: ({ on }) => (race.you.autopilot = on),
     pedals: ({ held, gamepad }) => {
-      race.hand.held = new Map(held.map((pedal, i) => [i, pedal]));
+      race.pedals = held;
       race.hand.gamepad = gamepad;
     },
   };

@@ -70,13 +70,14 @@ stad.figure("breed", async (part) => {
     part("plant").setAttribute("aria-disabled", "true");
     stad.announce(text);
     moment = 0;
-    part("flag").value = first;
+    if (wanted) clock.play();
+    showPlay();
     show();
   });
   const showPlay = () => (part("play").textContent = clock.running ? "Pause" : "Play");
   part("play").addEventListener("click", () => {
     wanted = !clock.running;
-    if (wanted) clock.play();
+    if (wanted && planted) clock.play();
     else clock.pause();
     showPlay();
   });
@@ -84,7 +85,8 @@ stad.figure("breed", async (part) => {
   show();
   return {
     run(on) {
-      if (on && wanted) clock.play();
+      if (on && wanted && planted)
+        clock.play(); // it would give the answer away
       else clock.pause();
       showPlay();
     },

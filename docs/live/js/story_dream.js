@@ -112,7 +112,7 @@
         const button = document.createElement("button");
         [button.type, button.textContent] = ["button", name];
         button.addEventListener("click", async () => {
-          if (bet || part("answer").textContent) return;
+          if (!part("after").hidden) return; // the first bet counts
           bet = { choice };
           button.setAttribute("aria-pressed", "true");
           part("after").hidden = false;
@@ -124,6 +124,7 @@
       }),
     );
     part("again").addEventListener("click", async () => {
+      part("answer").textContent = "";
       await restart();
       [wanted] = [true];
       clock.play();
@@ -154,11 +155,13 @@
   stad.figure("wheel", async (part) => {
     const { vae, approach, dreamOf, act } = await loadInstant();
     const LOST = 25; // frames in a row without a road under the car
+    const TAKE_OVER = 75; // frames that the hand drives for the reader at first
     const hand = new stad.Hand();
     const best = { you: 0, agent: 0 };
     let [dream, who, off, over, seed] = [null, null, 0, true, 1];
-    const clock = new stad.Clock(step, draw);
+    const clock = new stad.Clock(step, draw, 30); // slower than the car, so that one can react
     await approach();
+    const own = () => who === "you" && dream.frames >= TAKE_OVER;
 
     function begin(driver) {
       [dream, who, off, over] = [dreamOf(seed++), driver, 0, false];
@@ -170,7 +173,9 @@
     }
 
     function step() {
-      dream.step(who === "you" ? hand.act() : act(dream));
+      const action = own() ? hand.act() : act(dream);
+      hand.action.set(action);
+      dream.step(action);
       if (dream.frames >= stad.LONGEST) finish();
     }
 
@@ -179,8 +184,19 @@
       stad.paintFrame(part("view"), frame);
       if (over) return;
       off = onRoad(frame) ? 0 : off + 1;
-      part("seconds").textContent = `${inSeconds(dream.frames)} s`;
+      if (who === "you" && !own()) {
+        part("seconds").textContent =
+          `Take over in ${Math.ceil((TAKE_OVER - dream.frames) / 30)} ...`;
+        off = 0;
+        return;
+      }
+      part("seconds").textContent = `${lasted()} s`;
       if (off >= LOST) finish();
+    }
+
+    /** Seconds on the road, at the car's own pace. */
+    function lasted() {
+      return inSeconds(Math.max(0, dream.frames - off - (who === "you" ? TAKE_OVER : 0)));
     }
 
     /** Whether some road lies just beside the car, which is drawn at the bottom middle. */
@@ -194,11 +210,11 @@
     function finish() {
       over = true;
       clock.pause();
-      const lasted = (dream.frames - (off >= LOST ? LOST : 0)) / stad.FRAMES_A_SECOND;
-      best[who] = Math.max(best[who], lasted);
+      best[who] = Math.max(best[who], Number(lasted()));
+      part("seconds").textContent = `${lasted()} s`;
       part(`best-${who}`).textContent = `${best[who].toFixed(1)} s`;
       const name = who === "you" ? "You" : "The hand (C)";
-      const text = off >= LOST ? `left the dreamed road after ${lasted.toFixed(1)} seconds.` : "stayed on it for 20 seconds."; // prettier-ignore
+      const text = off >= LOST ? `left the dreamed road after ${lasted()} seconds.` : "stayed on it to the end."; // prettier-ignore
       part("answer").textContent = `${name} ${text}`;
       stad.announce(`${name} ${text}`);
     }

@@ -119,7 +119,7 @@ stad.figure("eye", async (part) => {
           }),
         );
         const used = one.kl_of_latents.filter((value) => value > 0.05).length;
-        const text = `KL weight ${one.kl_weight}: ${one.kl.toFixed(0)} nats, ${used} of 32 numbers in use.`;
+        const text = `KL weight ${one.kl_weight}: ${used} of 32 numbers in use.`;
         part("spent").textContent = text;
         part("weight").setAttribute("aria-valuetext", text);
       };

@@ -27,7 +27,8 @@ stad.figure("speed", async (part) => {
   });
 
   const score = () => {
-    const [first, second] = [Math.min(round + 1, BLIND), Math.max(0, round + 1 - BLIND)];
+    const done = Math.min(round + 1, ALL);
+    const [first, second] = [Math.min(done, BLIND), Math.max(0, done - BLIND)];
     const told = `From one frame ${right[0]} of ${first}`;
     return second ? `${told}, with the difference image ${right[1]} of ${second}.` : `${told}.`;
   };
@@ -71,6 +72,7 @@ stad.figure("speed", async (part) => {
       buttons.forEach((one, i) => one.setAttribute("aria-pressed", String(i === speed)));
       show(true);
     };
+    part("answer").textContent = score();
     part("bets").replaceChildren(...buttons);
     choose(2);
     buttons[2].focus({ preventScroll: true });
