@@ -329,3 +329,15 @@ def test_a_film_can_be_paused_and_begins_still_for_who_wants_no_motion(site, bro
             )
             button.press("Enter")
         page.close()
+
+
+@pytest.mark.parametrize("width", [390, 1100, 1300])
+def test_no_page_is_wider_than_its_window(width, site, browser):
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    for file in kinds_of_pages(site[0])[0]:
+        page.goto(file.as_uri())
+        wide = page.evaluate(
+            "document.querySelector('article')?.getBoundingClientRect().right ?? 0"
+        )
+        assert wide <= width, file
+    page.close()
