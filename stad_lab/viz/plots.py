@@ -346,9 +346,10 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
         edges = np.linspace(0, 1, len(share) + 1)
         axis.stairs(share * len(share), edges, color=color, ls=dash, lw=1.8, label=name)
     axis.axhline(1, color="black", lw=1, ls="--", label="uniform")
-    axis.set(xlabel=xlabel, ylabel="density", ylim=(0, None))
-    axis.legend(**SMALL)
     scaled = {name: share * len(share) for name, share in shares.items()}
+    lowest = min(0.8, *(own.min() - 0.05 for own in scaled.values()))
+    axis.set(xlabel=xlabel, ylabel="density (not from 0)", ylim=(lowest, None))
+    axis.legend(**SMALL)
     ranges = [f"{name} {min(own):.2g} to {max(own):.2g}" for name, own in scaled.items()]
     return describe(figure, title, "Histograms relative to uniform, 1: ", ranges)
 
@@ -407,7 +408,7 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
     if validation:
         style = {"color": "black", "ms": 4, "label": "C, validation tracks"}
         axis.plot(list(validation), list(validation.values()), "o--", **style)
-    axis.axhline(SOLVED, **THIN)
+    axis.axhline(SOLVED, **THIN, label=f"{SOLVED} points")
     axis.set(xlabel="generation", ylabel="fitness: mean return over the tracks")
     axis.set_ylim(min(-60, curves.min() - 20), 1000)
     axis.legend(**SMALL)
@@ -473,13 +474,19 @@ def plot_curves(
     return describe(figure, title, "Lines: ", ends)
 
 
-def plot_returns(returns: dict[str, np.ndarray], title: str) -> Figure:
-    """Every episode's return as a dot, a row for each name, with the mean as a bar."""
+def plot_returns(returns: dict[str, np.ndarray], title: str, paired: bool = False) -> Figure:
+    """Every episode's return as a dot, a row for each name, with the mean as a bar.
+
+    `paired`: the rows have the same episodes in the same order, and lines join them.
+    """
     figure, ((axis,),) = new_figure(7.0, 0.8 * len(returns) + 1.4)
     rng, text = np.random.default_rng(0), {"va": "center", "fontsize": 9}
+    if paired:
+        axis.plot(list(returns.values()), range(len(returns)), color="0.8", lw=1, zorder=0)
     for row, (values, color) in enumerate(zip(returns.values(), cycle(COLORS), strict=False)):
-        mean = values.mean()
-        axis.scatter(values, row + rng.uniform(-0.22, 0.22, len(values)), 12, color, alpha=0.6)
+        mean, spread = values.mean(), 0.22 * (not paired)
+        heights = row + rng.uniform(-spread, spread, len(values))
+        axis.scatter(values, heights, 12, color, alpha=0.6)
         axis.plot([mean] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
         axis.text(1.01, row, f"mean {mean:.0f}", transform=axis.get_yaxis_transform(), **text)
     axis.axvline(SOLVED, **THIN)
@@ -542,10 +549,12 @@ def plot_intervals(
             y = place + (shift if len(found[row]) > 1 else 0)
             outside = value < lowest
             x, mark = (lowest, "<") if outside else (value, mark)
+            lower = 0.18 * bool(single)  # the single values go below their mean
+            y -= lower / 2
             axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.5)
             axis.plot(x, y, mark, color=color, ms=5, clip_on=not outside)
             for places in single:
-                axis.plot(places, [y] * len(places), "|", color=color, ms=8, mew=1.5)
+                axis.plot(places, [y + 2 * lower] * len(places), "|", color=color, ms=8, mew=1.2)
             if name in read:
                 values.append(" ".join(filter(None, (panel, row, name, f"{value:.3g}"))))
         name_rows(axis, rows)
@@ -620,7 +629,7 @@ def plot_learning(generations: list[dict], total: int, title: str) -> Figure:
     axis.plot(number, returns, ".", color=BLUE, ms=3, alpha=0.5)
     axis.plot(number, returns.max(axis=1), color=ORANGE, lw=1.6, label="best candidate")
     axis.plot(number, returns.mean(axis=1), color=BLUE, lw=2.2, label="average candidate")
-    axis.axhline(SOLVED, **THIN)
+    axis.axhline(SOLVED, **THIN, label=f"{SOLVED} points")
     axis.set(xlabel="generation", ylabel="return of an episode", xlim=(0.5, total + 0.5))
     axis.set_ylim(min(-20, returns.min() - 20), 960)
     legend_below(figure, axis)
