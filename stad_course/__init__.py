@@ -1,1 +1,1 @@
-"""What a course adds to the lessons: checks of the exercises, and a competition."""
+"""What a course adds: predictions and quizzes, checks of the exercises, and a competition."""

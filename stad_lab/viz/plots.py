@@ -546,7 +546,7 @@ def plot_intervals(
             if name not in found[row]:
                 continue
             (value, interval, *single), (mark, color, shift) = found[row][name], styles[name]
-            y = place + (shift if len(found[row]) > 1 else 0)
+            y = place + (float(shift) if len(found[row]) > 1 else 0.0)
             outside = value < lowest
             x, mark = (lowest, "<") if outside else (value, mark)
             lower = 0.18 * bool(single)  # the single values go below their mean

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stad_lab.training import ten_lines
+from stad_course import ten_lines
 
 
 def test_ten_lines_climb_a_hill():

@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from stad_lab.viz.lesson import predict, quiz
+from stad_course.lesson import predict, quiz
 
 NOTEBOOKS = Path(__file__).parents[2] / "notebooks"
 DRAWINGS = sorted((NOTEBOOKS / "pictures" / "schematics").glob("*.svg"))

@@ -4,7 +4,7 @@ import ipywidgets
 import numpy as np
 from matplotlib.figure import Figure
 
-from stad_lab.viz.lesson import panel
+from stad_course.lesson import panel
 from stad_lab.viz.plots import BLUE, GREEN, RED, describe, name_rows, new_figure
 from stad_lab.viz.widgets import show
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stad_lab.viz.bets import ANSWERS, TwoRuns, best_rule, deal
+from stad_course.bets import ANSWERS, TwoRuns, best_rule, deal
 
 SCORES = np.array([np.arange(12.0), 30 + np.arange(12.0)])
 
