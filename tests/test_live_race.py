@@ -25,6 +25,18 @@ def test_a_race_begins_with_one_key_scores_pauses_and_goes_on(opened):
     phase(page, "paused")
 
 
+def test_the_easy_way_gives_no_gas_above_60_until_it_is_switched_off(opened):
+    page = opened("race")
+    page.keyboard.down("ArrowUp")
+    phase(page, "race")
+    page.wait_for_function("stad.page.state.you.frames > 200")
+    assert 50 < page.evaluate("stad.page.state.you.pose.speed") < 63
+    page.uncheck("#easy")
+    page.keyboard.up("ArrowUp")
+    page.keyboard.down("ArrowUp")  # the box has the focus, and the keys drive all the same
+    page.wait_for_function("stad.page.state.you.pose.speed > 70")
+
+
 def test_closed_eyes_show_the_dream_while_the_car_drives_on(opened):
     page = opened("race")
     page.keyboard.down("ArrowUp")

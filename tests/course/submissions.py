@@ -1,4 +1,4 @@
-"""Submissions of an imaginary class: most of them drive, fifteen misbehave, each in its own way."""
+"""Submissions of an imaginary class: most of them drive, seventeen misbehave, each in its own way."""
 
 from stad_course.compete.drive import STARTER
 
@@ -36,6 +36,8 @@ MISBEHAVE = {
     "memory": ("act", "if self.frame == 5: self.hog = np.ones((9000, 1000, 100))", "memory"),
     "forks": ("act", "for _ in range(200): subprocess.Popen(['sleep', '60'])", ""),
     "noise": ("act", "os.write(3, b'x' * 99); os.write(4, b'x' * 99)", ""),
+    "syntax": ("top", "def broken(:", "SyntaxError"),
+    "floods": ("act", "for _ in range(200): print('x' * 10_000_000)", "longer than the limit"),
     "network": ("act", "socket.create_connection(('192.0.2.1', 80), 1)", ""),
 }
 # These do no harm, and their authors need not hear of anything.

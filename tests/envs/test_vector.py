@@ -5,6 +5,7 @@ import sys
 
 import gymnasium as gym
 import numpy as np
+import psutil
 import pytest
 from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -191,3 +192,16 @@ print(envs.spec.id, envs.max_episode_steps, envs.num_envs)
     assert process.returncode == 0, process.stderr
     expected = ["CarRacingVector (4, 96, 96, 3) SameStep", "StadLab/CarRacing-v3 1000 4"]
     assert process.stdout.splitlines() == expected
+
+
+@pytest.mark.long
+def test_a_million_steps_take_no_more_memory_than_the_first_thousands():
+    cars = gym.make_vec("stad_lab:StadLab/CarRacing-v3", num_envs=16)
+    cars.reset(seed=0)
+    actions, used = np.full((16, 3), (0.1, 0.3, 0.0), np.float32), []
+    for _ in range(5):
+        for _ in range(1_000_000 // 16 // 5):
+            cars.step(actions)
+        used.append(psutil.Process().memory_info().rss / 2**20)
+    cars.close()
+    assert used[-1] - used[0] < 5  # MiB

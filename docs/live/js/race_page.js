@@ -468,8 +468,9 @@ stad.start(async () => {
 
   function sendPedals() {
     const pads = stad.readGamepad();
-    const auto = touching && !held.has("brake") ? ["cruise"] : []; // gas by itself
-    worker.postMessage({ type: "pedals", held: [...held.values(), ...auto], gamepad: pads });
+    const down = [...held.values()];
+    if (touching && !held.has("brake")) down.push("gas"); // by itself
+    worker.postMessage({ type: "pedals", held: down, easy: get("easy").checked, gamepad: pads });
   }
 
   /** A driver has touched a pedal: begin, or go on. */
@@ -488,7 +489,7 @@ stad.start(async () => {
 
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.altKey || event.metaKey) return;
-    if (event.target.matches("input, select, textarea")) return;
+    if (event.target.matches("select")) return;
     if (event.key === "Escape") {
       setPaused(true);
       document.activeElement.blur();
@@ -502,7 +503,7 @@ stad.start(async () => {
       return state.phase === "paused" ? wish() : setPaused(true);
     if (event.key.toLowerCase() === "e" && !event.repeat) return toggleEyes();
     const pedal = KEYS[event.code];
-    if (!pedal || (event.code === "Space" && event.target.matches("button"))) return;
+    if (!pedal || (event.code === "Space" && event.target.matches("button, input"))) return;
     event.preventDefault();
     if (event.repeat) return;
     held.set(event.code, pedal);
@@ -569,6 +570,7 @@ stad.start(async () => {
       wish();
       sendPedals();
     });
+  get("easy").addEventListener("change", sendPedals);
   get("again").addEventListener("click", begin);
   get("another").addEventListener("click", () => {
     drive(Math.floor(Math.random() * 10000));

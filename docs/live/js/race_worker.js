@@ -51,7 +51,7 @@ stad.Race = class {
     this.phase = "waiting"; // "attract": the agent drives alone; "race"; "paused"; "over"
     this.resting = false; // no car drives before the race while nobody sees it
     this.steps = 0;
-    this.pedals = [];
+    [this.pedals, this.easy] = [[], true];
   }
 
   async load({ code, facts, tables }) {
@@ -116,11 +116,11 @@ stad.Race = class {
     if (you.car.over) this.finish();
   }
 
-  /** Pedals that are down; "cruise" is gas up to a speed, which is lower while a finger steers. */
+  /** Pedals that are down; who drives the easy way gets gas up to a speed, a lower one in bends. */
   press(speed) {
     const steers = this.pedals.some((one) => one === "left" || one === "right");
-    const cruise = speed < (steers ? 35 : 55) ? "gas" : "none";
-    const down = this.pedals.map((one) => (one === "cruise" ? cruise : one));
+    const fast = this.easy && speed > (steers ? 40 : 60);
+    const down = this.pedals.filter((one) => !(fast && one === "gas"));
     this.hand.held = new Map(down.map((pedal, i) => [i, pedal]));
   }
 
@@ -189,7 +189,8 @@ if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScop
     rest: ({ on }) => race.rest(on),
     eyes: ({ closed }) => race.closeEyes(closed),
     autopilot: ({ on }) => (race.you.autopilot = on),
-    pedals: ({ held, gamepad }) => {
+    pedals: ({ held, gamepad, easy }) => {
+      race.easy = easy;
       race.pedals = held;
       race.hand.gamepad = gamepad;
     },
