@@ -77,7 +77,8 @@ class Prediction(ipywidgets.VBox):
         result, because = self.revealed
         found = f"<b>Result: {self.text(result)}.</b> {escape(because)}"
         if self.answer is None:
-            return panel(BLUE, "You made no prediction.", found)
+            asked = "<summary>Show the result, without a prediction</summary>"
+            return panel(BLUE, f"<details>{asked}{found}</details>")
         right = self.answer == result
         mark = " &#10003;" if right else ""  # a tick
         color = GREEN if right else BLUE
