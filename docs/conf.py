@@ -152,13 +152,6 @@ def help_screen_readers(app, page, template, context, doctree) -> None:
         context[part] = re.sub(r"<th([^>]*)>(\s*(?:<p></p>)?\s*)</th>", r"<td\1>\2</td>", leveled)
 
 
-def shorten_navigation(app, page, template, context, doctree) -> None:
-    """Leave the hundred modules out of the sidebar of each module: they made the build slow."""
-    if page.startswith("docs/modules/"):
-        whole = context["toctree"]
-        context["toctree"] = lambda **options: whole(**options | {"maxdepth": 1})
-
-
 def style_live_page(app, page, template, context, doctree) -> None:
     """Give the live pages their own style sheet."""
     if page.startswith("docs/live/") or page == "docs/index":  # which shows the game
@@ -183,7 +176,6 @@ def setup(app) -> None:
     app.connect("doctree-read", explain_widgets)
     app.connect("doctree-read", offer_colab)
     app.connect("html-page-context", style_live_page)
-    app.connect("html-page-context", shorten_navigation, priority=400)  # the theme's comes next
     app.connect("build-finished", write_live_scripts)
     app.connect("html-page-context", help_screen_readers, priority=900)  # the theme's come first
     app.connect("build-finished", check_site, priority=900)

@@ -1,4 +1,4 @@
-"""Submissions of an imaginary class: most of them drive, seventeen misbehave, each in its own way."""
+"""Submissions of an imaginary class: most drive, seventeen misbehave, each in its own way."""
 
 from stad_course.compete.drive import STARTER
 
