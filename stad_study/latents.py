@@ -64,7 +64,7 @@ DREAMERS = 60  # trajectories from which M dreams on
 
 
 @dataclass(frozen=True)
-class Study:
+class Given:
     """What every part of `measure` works with."""
 
     config: Config  # of the dataset and of what is trained here
@@ -83,9 +83,9 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[st
     collect(config, dataset_folder)
     count = max(FEWEST, config.data.episodes // 5)
     driven = random_trajectories(count, config.seed + 1, config.processes)
-    study, file, result = Study(config, dataset_folder, work, driven), work / "latents.json", {}
+    given, file, result = Given(config, dataset_folder, work, driven), work / "latents.json", {}
     for name in parts:
-        found = PARTS[name](study)
+        found = PARTS[name](given)
         found |= {"trajectories": len(driven), "config": config.as_dict()}
         found["made_with"] = provenance(f"python -m stad_study latents --parts {name} --out ...")
         result[name] = found
@@ -99,9 +99,9 @@ def shipped(prefix: str = "cropped_") -> Iterator[tuple[str, WorldModel]]:
         yield variant, load_world_model(PRETRAINED / f"{prefix}{variant}")
 
 
-def probe_part(study: Study) -> dict:
+def probe_part(given: Given) -> dict:
     """Probe the latents of every variant, of untrained V, and of every stride: two drivers."""
-    config, names = study.config, ("frame", "input_output")
+    config, names = given.config, ("frame", "input_output")
     with torch_settings(config.seed, 0):
         untrained = {name: VAE.of(config.replace(variant=name)) for name in names}
         mdn_rnn = MDNRNN.of(config)
@@ -113,45 +113,45 @@ def probe_part(study: Study) -> dict:
     for name, vae in untrained.items():
         encoders[f"{name}, untrained"] = Encoder(vae, config.vae.stride, config.data.crop_bar, {})
     for stride in STRIDES:
-        encoders[f"stride {stride}"] = shorter_encoder(study, stride=stride)
+        encoders[f"stride {stride}"] = shorter_encoder(given, stride=stride)
     found = {
         driver: {name: probe_trajectories(*driven, one) for name, one in encoders.items()}
-        for driver, driven in two_drivers(study.trajectories, config.processes).items()
+        for driver, driven in two_drivers(given.trajectories, config.processes).items()
     }
     return {"drivers": found}
 
 
-def shorter_encoder(study: Study, **change) -> Encoder:
+def shorter_encoder(given: Given, **change) -> Encoder:
     """V of `input_output`, trained with one change for a share of the steps; kept in `work`."""
-    ((name, value),), usual = change.items(), study.config.vae
+    ((name, value),), usual = change.items(), given.config.vae
     if value == getattr(usual, name):  # no change: one training serves all comparisons
         name, value = "stride", usual.stride
-    folder = study.work / f"{name}_{value:g}"
+    folder = given.work / f"{name}_{value:g}"
     settings = {"steps": round(SHORTER * usual.steps), **change}
-    config = study.config.replace(variant="input_output", vae=settings)
-    train(config, folder, study.dataset, until="vae")
+    config = given.config.replace(variant="input_output", vae=settings)
+    train(config, folder, given.dataset, until="vae")
     vae, _ = weights.load_vae(folder / weights.VAE_FILE)
     return Encoder(vae, config.vae.stride, config.data.crop_bar, {})
 
 
-def vae_part(study: Study) -> dict:
+def vae_part(given: Given) -> dict:
     """Measure V of every variant, and rate against distortion."""
 
     def measured(encoder: Encoder) -> dict:
         vae, stride, crop_bar, _ = encoder
-        films = [one.frames(crop_bar) for one in study.trajectories]
+        films = [one.frames(crop_bar) for one in given.trajectories]
         frames = np.concatenate([film[stride::3] for film in films])
         earlier = np.concatenate([earlier_frames(film, stride)[stride::3] for film in films])
         return metrics.vae_metrics(vae, frames, earlier)
 
     variants = {variant: measured(encoder_of(model, {})) for variant, model in shipped()}
-    shorter = {f"{one:g}": measured(shorter_encoder(study, kl_weight=one)) for one in KL_WEIGHTS}
+    shorter = {f"{one:g}": measured(shorter_encoder(given, kl_weight=one)) for one in KL_WEIGHTS}
     return {"variants": variants, "rate_distortion": shorter}
 
 
-def mdn_rnn_part(study: Study) -> dict:
+def mdn_rnn_part(given: Given) -> dict:
     """Measure M of every variant; for `input` also the reduced M."""
-    whole = [one for one in study.trajectories if len(one) == RANDOM_FRAMES]
+    whole = [one for one in given.trajectories if len(one) == RANDOM_FRAMES]
     actions = np.array([one.actions for one in whole])
     result: dict[str, Any] = {
         "whole_trajectories": len(whole),
@@ -170,7 +170,7 @@ def mdn_rnn_part(study: Study) -> dict:
         dreamed = metrics.dream_open_loop(model.mdn_rnn, some, actions[:DREAMERS], AWAKE)
         nll = {"M": metrics.mixture_nll(mixture, z), **simple_predictions(z, actions)}
         if variant == "input":
-            nll |= reduced_predictions(study, model, z, actions)
+            nll |= reduced_predictions(given, model, z, actions)
         result["variants"][variant] = {
             "active": int(active.sum()),
             "nll": compare(nll, active),
@@ -210,16 +210,16 @@ def simple_predictions(z: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarr
 
 
 def reduced_predictions(
-    study: Study, model: WorldModel, z: np.ndarray, actions: np.ndarray
+    given: Given, model: WorldModel, z: np.ndarray, actions: np.ndarray
 ) -> dict[str, np.ndarray]:
     """NLL of M that lack something, trained like the whole one."""
-    result, usual = {}, study.config.mdn_rnn
+    result, usual = {}, given.config.mdn_rnn
     for name, (changes, sees_actions) in REDUCED.items():
         batch = usual.batch * usual.sequence // changes.get("sequence", usual.sequence)
-        config = study.config.replace(variant=model.vae.variant, mdn_rnn={"batch": batch} | changes)
-        path = study.work / name.replace(" ", "_") / weights.MDN_RNN_FILE
+        config = given.config.replace(variant=model.vae.variant, mdn_rnn={"batch": batch} | changes)
+        path = given.work / name.replace(" ", "_") / weights.MDN_RNN_FILE
         if not path.exists():
-            dataset = Dataset(study.dataset)
+            dataset = Dataset(given.dataset)
             shown = [action * sees_actions for action in dataset.actions]
             encoded = encode_dataset(model.vae, dataset, model.stride)
             latents = Latents(encoded, shown, dataset.first_heldout, model.checksums["vae"])

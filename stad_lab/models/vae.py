@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import nn
 
-VARIANTS = {  # whether V sees, and whether it reconstructs, the difference image
+DIFFERENCE = {  # whether V sees, and whether it reconstructs, the difference image
     "frame": (False, False),
     "input": (True, False),
     "output": (False, True),
@@ -32,17 +32,17 @@ class VAE(nn.Module):
     """V: pictures -> latent z -> pictures.
 
     Args:
-        variant: one of VARIANTS.
+        variant: one of DIFFERENCE.
         latent_size: dimensions of z.
         width: channels of the first convolution (World Models: 32).
     """
 
     def __init__(self, variant: str, latent_size: int = 32, width: int = 32):
         super().__init__()
-        if variant not in VARIANTS:
-            raise ValueError(f"unknown variant {variant!r}: choose one of {', '.join(VARIANTS)}")
+        if variant not in DIFFERENCE:
+            raise ValueError(f"unknown variant {variant!r}: choose one of {', '.join(DIFFERENCE)}")
         self.variant, self.latent_size, self.width = variant, latent_size, width
-        self.sees_difference, self.reconstructs_difference = VARIANTS[variant]
+        self.sees_difference, self.reconstructs_difference = DIFFERENCE[variant]
         self.encoder = nn.Sequential(
             nn.Conv2d(6 if self.sees_difference else 3, width, 4, stride=2),  # 64 -> 31 pixels
             nn.ReLU(inplace=True),

@@ -22,7 +22,7 @@ from stad_study.cli import main
 from stad_study.latents import (
     HORIZON,
     REDUCED,
-    Study,
+    Given,
     compare,
     measure,
     reduced_predictions,
@@ -60,7 +60,7 @@ def measured(quick_run, tmp_path_factory):
 @pytest.fixture
 def reduced(measured, quick_run):
     """The arguments of `reduced_predictions`, on random z and actions."""
-    rng, study = np.random.default_rng(0), Study(QUICK, quick_run / "dataset", measured, [])
+    rng, study = np.random.default_rng(0), Given(QUICK, quick_run / "dataset", measured, [])
     z, actions = rng.standard_normal((4, 20, 32), np.float32), rng.random((4, 20, 3), np.float32)
     return study, load_world_model(PRETRAINED / "cropped_input"), z, actions
 
@@ -101,7 +101,7 @@ def test_one_reduced_m_alone_is_trained_without_actions(quick_run, reduced, tmp_
         return fit_mdn_rnn(config, data, path, device)
 
     monkeypatch.setattr(latents, "fit_mdn_rnn", fit)
-    brief = Study(QUICK.replace(mdn_rnn={"steps": 2}), quick_run / "dataset", tmp_path, [])
+    brief = Given(QUICK.replace(mdn_rnn={"steps": 2}), quick_run / "dataset", tmp_path, [])
     reduced_predictions(brief, *reduced[1:])
     assert len(shown) == len(REDUCED)
     assert [name for name, actions in shown.items() if not actions.any()] == ["no_actions"]
@@ -113,7 +113,7 @@ def test_a_reduced_m_of_another_v_or_other_settings_is_refused(reduced):
     with pytest.raises(ValueError, match="another"):
         reduced_predictions(study, another, *data)
     for field in ("hidden_size", "steps"):
-        changed = Study(QUICK.replace(mdn_rnn={field: 9}), study.dataset, study.work, [])
+        changed = Given(QUICK.replace(mdn_rnn={field: 9}), study.dataset, study.work, [])
         with pytest.raises(ValueError, match=field):
             reduced_predictions(changed, model, *data)
 
