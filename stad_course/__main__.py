@@ -1,11 +1,6 @@
 """`python -m stad_course`: the command line of `stad_course.cli`."""
 
-import sys
-
-from stad_lab.streams import open_program
+from stad_lab.streams import run_program
 
 if __name__ == "__main__":
-    open_program(progress=())
-    from stad_course.cli import main
-
-    sys.exit(main())
+    run_program("stad_course", progress=())

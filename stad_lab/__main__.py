@@ -3,22 +3,14 @@
 import io
 import sys
 
-from stad_lab.streams import open_program
+from stad_lab.streams import open_missing_streams, run_program
 
 if __name__ == "__main__":
-    open_program(progress=("train", "fine-tune", "probe"))
     if sys.argv[1:] == ["check"]:  # it must run where the command line's own packages are missing
+        open_missing_streams()
         from stad_lab.doctor import tell_environment
 
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")  # for letters that a console lacks
         sys.exit(tell_environment())
-    try:
-        from stad_lab.cli import main
-    except KeyboardInterrupt:  # which `main` itself handles
-        print("\nstopped", file=sys.stderr)
-        sys.exit(130)
-    except ModuleNotFoundError as error:
-        print(f"error: {error}: pip install 'stad_lab[train]'", file=sys.stderr)
-        sys.exit(2)
-    sys.exit(main())
+    run_program("stad_lab", progress=("train", "fine-tune", "probe"))

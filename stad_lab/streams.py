@@ -1,8 +1,9 @@
 """Output that may be gone: a training does not end because nobody reads what it prints."""
 
+import importlib
 import os
 import sys
-from typing import TextIO
+from typing import NoReturn, TextIO
 
 
 def open_missing_streams() -> None:
@@ -59,8 +60,20 @@ def make_streams_last() -> None:
     sys.stdout, sys.stderr = Lasting(sys.stdout), Lasting(sys.stderr)
 
 
-def open_program(progress: tuple[str, ...]) -> None:
-    """Prepare the streams of a command line; commands in `progress` outlive their readers."""
+def run_program(package: str, progress: tuple[str, ...]) -> NoReturn:
+    """Run a package's command line, `main` of its module `cli`, and end with its status.
+
+    Commands in `progress` outlive the readers of their output.
+    """
     open_missing_streams()
     if sys.argv[1:2] and sys.argv[1] in progress:
         make_streams_last()
+    try:
+        main = importlib.import_module(f"{package}.cli").main
+    except KeyboardInterrupt:  # which `main` itself handles
+        print("\nstopped", file=sys.stderr)
+        sys.exit(130)
+    except ModuleNotFoundError as error:
+        print(f"error: {error}: pip install 'stad_lab[train]'", file=sys.stderr)
+        sys.exit(2)
+    sys.exit(main())

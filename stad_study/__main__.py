@@ -1,11 +1,6 @@
 """`python -m stad_study`: the command line of `stad_study.cli`."""
 
-import sys
-
-from stad_lab.streams import open_program
+from stad_lab.streams import run_program
 
 if __name__ == "__main__":
-    open_program(progress=("replicate", "latents", "probe"))
-    from stad_study.cli import main
-
-    sys.exit(main())
+    run_program("stad_study", progress=("replicate", "latents", "probe"))

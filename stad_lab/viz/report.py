@@ -16,9 +16,8 @@ from stad_lab.training.evolution import LOG, fitness_curves
 from stad_lab.training.record import GIVE_A_RUN, MACHINE, PACKAGES, RECORD, check_record, starts
 from stad_lab.viz import plots
 from stad_lab.viz.page import document, picture
-from stad_lab.viz.video import film_agent
+from stad_lab.viz.video import FILM, film_agent
 
-FILM = {"track": 5, "first": 60, "frames": 150}  # after the opening zoom
 STYLE = """
 main>figure>img{width:100%;border-radius:.4rem;background:#fff}td,th{text-align:left}
 td,th{white-space:normal}.number{font-size:1.6rem;font-weight:600;margin:.2rem 0}

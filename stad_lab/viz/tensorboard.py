@@ -16,10 +16,9 @@ from stad_lab.evaluation.trajectories import (
 )
 from stad_lab.io.weights import CONTROLLER_FILE, VAE_FILE, load_vae
 from stad_lab.training.evolution import fitness_curves
-from stad_lab.viz.video import film_agent
+from stad_lab.viz.video import FILM, film_agent
 
-TRACK, FRAMES = 5, 400  # of the episode whose latents and film are shown
-FILM = {"track": TRACK, "first": 60, "frames": 150}
+FRAMES = 400  # of the episode whose latents are shown
 
 
 class TensorBoard:
@@ -56,7 +55,7 @@ class TensorBoard:
         if (folder / CONTROLLER_FILE).exists():
             agent = load_agent(str(folder))
             self.add_film("agent", film_agent(agent, **FILM))
-            self.add_latents(folder, record_trajectory(agent, TRACK, FRAMES))
+            self.add_latents(folder, record_trajectory(agent, FILM["track"], FRAMES))
         self.writer.close()
 
     def add_film(self, name: str, gif: bytes) -> None:

@@ -4,6 +4,7 @@ globalThis.stad ??= {};
 
 stad.evolveSettings = {
   KEY: "stad-evolve", // in the browser's storage
+  SEED: /^\d{1,9}$/,
   NAMES: ["population", "sigma", "decay", "tracks", "sees", "agent", "seed"],
 
   /** Settings from texts by their names, with the page's own for what is missing or wrong. */
@@ -12,9 +13,7 @@ stad.evolveSettings = {
     for (const name of this.NAMES) {
       const { options, dataset } = stad.get(name);
       const text = texts.get(name) ?? "";
-      const valid = options
-        ? [...options].some((one) => one.value === text)
-        : /^\d{1,9}$/.test(text);
+      const valid = options ? [...options].some((one) => one.value === text) : this.SEED.test(text);
       const value = valid ? text : dataset.first;
       found[name] = name === "sees" || name === "agent" ? value : Number(value);
     }
@@ -39,7 +38,7 @@ stad.evolveSettings = {
   /** What is wrong with the seed, the one setting that is typed; null if nothing is. */
   wrong() {
     const { value } = stad.get("seed");
-    if (/^\d{1,9}$/.test(value)) return null;
+    if (this.SEED.test(value)) return null;
     return `Seed ${value || "(empty)"}: give a whole number from 0 to 999999999.`;
   },
 

@@ -250,8 +250,9 @@ stad.start(async () => {
     context.fillStyle = "#fff";
     context.font = "600 17px system-ui, sans-serif";
     context.textAlign = "center";
-    const auto = get("auto").getAttribute("aria-pressed") === "true";
-    const told = auto ? "It has never learned to find back." : "The arrow leads back to the road.";
+    const told = autopilot()
+      ? "It has never learned to find back."
+      : "The arrow leads back to the road.";
     context.fillText(told, width / 2, 0.2 * height);
   }
 
@@ -448,6 +449,8 @@ stad.start(async () => {
     stad.announce(asleep ? "The eyes are closed: you see the dream." : `Awake after ${slept} s.`);
   }
 
+  const autopilot = () => get("auto").getAttribute("aria-pressed") === "true";
+
   function setAuto(on) {
     worker.postMessage({ type: "autopilot", on });
     get("auto").setAttribute("aria-pressed", String(on));
@@ -508,7 +511,7 @@ stad.start(async () => {
     if (event.repeat) return;
     held.set(event.code, pedal);
     touching = false;
-    if (get("auto").getAttribute("aria-pressed") === "true") setAuto(false);
+    if (autopilot()) setAuto(false);
     wish();
     sendPedals();
   });
@@ -545,7 +548,7 @@ stad.start(async () => {
     if (event.pointerType === "mouse" || state?.phase !== "race") return; // a click begins
     event.preventDefault();
     get("race").setPointerCapture(event.pointerId);
-    if (get("auto").getAttribute("aria-pressed") === "true") setAuto(false);
+    if (autopilot()) setAuto(false);
     touched = true;
     steer(event);
   });
@@ -578,9 +581,7 @@ stad.start(async () => {
   });
   get("pause").addEventListener("click", () => setPaused(state.phase === "race"));
   get("eyes").addEventListener("click", toggleEyes);
-  get("auto").addEventListener("click", () =>
-    setAuto(get("auto").getAttribute("aria-pressed") === "false"),
-  );
+  get("auto").addEventListener("click", () => setAuto(!autopilot()));
   get("agent").addEventListener("change", ({ target }) => {
     const chosen = target.value === "evolved" ? evolved : { driver: null, agent: target.value };
     ({ driver, agent } = chosen);
