@@ -11,7 +11,9 @@ import numpy as np
 
 from stad_lab.evaluation import statistics
 from stad_study import tables
-from stad_study.study5 import ARMS, REPEATS, find_runs
+from stad_study.evolved import count_runs
+from stad_study.study import STUDIES
+from stad_study.study5 import ARMS, REPEATS, STUDY5
 from stad_study.study_claims import compare, find_verdict
 
 Families = dict[tuple[str, ...], dict[str, tuple[dict[str, float], ...]]]
@@ -45,15 +47,12 @@ def describe_study5(folder: Path = tables.DATA) -> dict:
 
     An arm is named by variant and what C sees: "frame: z + motion".
     """
-    table = tables.read_or_empty("study5_runs", folder)
-    done = set(table[tables.SENSED].itertuples(index=False, name=None))
-    planned = {part: find_runs(parts=[part]) for part in ARMS}
-    counts = {part: sum(tuple(run) in done for run in runs) for part, runs in planned.items()}
+    counts = count_runs(STUDY5, folder)
     found: dict[str, Any] = {
-        "runs": counts,
-        "planned": {part: len(runs) for part, runs in planned.items()},
+        "runs": {part: done for part, (done, _) in counts.items()},
+        "planned": {part: planned for part, (_, planned) in counts.items()},
     }
-    complete = [part for part in ARMS if counts[part] == len(planned[part])]
+    complete = [part for part, (done, planned) in counts.items() if done == planned]
     scores = scores_of(complete, folder)
     found["arms"] = {arm: describe_arm(own) for arm, own in scores.items()}
     found["comparisons"] = {}
@@ -71,7 +70,7 @@ def scores_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndar
     table = tables.read("study5_returns", folder).set_index(tables.SENSED)
     table, found = table[[column for column in table if column.isdigit()]], {}
     for variant, sees in (arm for part in parts for arm in ARMS[part]):
-        seeds = dict.fromkeys(run.seed for run in find_runs(parts=parts))
+        seeds = STUDIES["study1"].seeds
         runs = [[table.loc[(seed, variant, sees, n)] for n in REPEATS] for seed in seeds]
         found[f"{variant}: {sees}"] = np.mean(runs, axis=1)
     return found

@@ -18,6 +18,7 @@ from stad_lab.models.vae import VAE
 from stad_lab.training.evolution import LOG
 from stad_lab.training.trainer import torch_settings
 from stad_study import tables, world_facts
+from stad_study.evolved import find_runs, run_evolved
 from stad_study.networks import WORLD_MODEL_FILE, keep_world_model, load_kept_world_model
 from stad_study.senses import (
     COLUMNS,
@@ -29,7 +30,7 @@ from stad_study.senses import (
     whiten,
 )
 from stad_study.study import SCORE, STUDIES
-from stad_study.study5 import find_runs, run_study5
+from stad_study.study5 import STUDY5
 from stad_study.world_facts import WORLD_FILE, load_sense
 
 CONFIG = Config.preset(
@@ -62,8 +63,8 @@ def networks(tmp_path_factory):
 def made(networks, tmp_path_factory):
     """The folder of one run of each arm, with its tables in `data`."""
     folder = tmp_path_factory.mktemp("study5")
-    only = [run.name for run in find_runs() if run.repeat == 1]
-    run_study5(folder, only=only, to=folder / "data", networks=networks)
+    only = [run.name for run in find_runs(STUDY5) if run.repeat == 1]
+    run_evolved(STUDY5, folder, only=only, to=folder / "data", networks=networks)
     return folder
 
 
@@ -74,7 +75,7 @@ def load(networks, folder, variant, sees):
 
 
 def test_every_arm_has_three_runs_a_seed_with_their_own_evolution_seeds():
-    runs = find_runs()
+    runs = find_runs(STUDY5)
     assert len({run.name for run in runs}) == len(runs) == 12 * 3
     assert {run.config.evolution.seed for run in runs} == {101, 102, 103}
     assert [run.sees for run in runs[:6]] == ["z", "z, h"] * 3
@@ -87,7 +88,9 @@ def test_the_runs_of_a_repeat_drive_the_same_tracks_and_are_in_the_tables(made):
     assert np.allclose(
         returns[[str(t) for t in range(1000, 1018)]].mean(axis=1), table["mean"], atol=0.01
     )
-    logs = [load_json(made / "study5" / run.name / LOG) for run in find_runs() if run.repeat == 1]
+    logs = [
+        load_json(made / "study5" / run.name / LOG) for run in find_runs(STUDY5) if run.repeat == 1
+    ]
     assert len({str([entry["tracks"] for entry in log["generations"]]) for log in logs}) == 1
     assert table["controller"].nunique() > 10  # C that see z - motion and z - placebo differ, too
     kept, _ = load_tensors(made / "networks/study5/seed0.safetensors")
@@ -100,11 +103,11 @@ def test_a_repeated_run_is_compared_with_the_recorded_one(made, networks, tmp_pa
     world.parent.mkdir(parents=True)
     shutil.copy(made / "study5" / name / WORLD_FILE, world)
     only = [f"{name}/z_-_motion/1"]
-    run_study5(tmp_path, only=only, to=made / "data", networks=networks)
+    run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
     assert "bit-identical" in capsys.readouterr().out
     score = load_json(tmp_path / "study5" / only[0] / SCORE)
     save_json(tmp_path / "study5" / only[0] / SCORE, score | {"returns": score["returns"][::-1]})
-    run_study5(tmp_path, only=only, to=made / "data", networks=networks)
+    run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
     assert "differs in returns" in capsys.readouterr().out
 
 
@@ -162,6 +165,6 @@ def test_erasure_leaves_no_linear_trace_and_the_placebo_takes_as_much_variance()
 
 def test_an_unknown_run_or_seed_is_refused():
     with pytest.raises(ValueError, match="has no seed 12"):
-        find_runs([12])
+        find_runs(STUDY5, [12])
     with pytest.raises(ValueError, match="seed0/frame/y"):
-        find_runs(only=["seed0/frame/y"])
+        find_runs(STUDY5, only=["seed0/frame/y"])

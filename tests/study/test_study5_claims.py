@@ -5,7 +5,8 @@ import pandas
 import pytest
 
 from stad_study import tables
-from stad_study.study5 import find_runs
+from stad_study.evolved import find_runs
+from stad_study.study5 import STUDY5
 from stad_study.study5_claims import describe_study5
 
 EFFECTS = {"z + motion": 40, "z - motion": -40}  # points
@@ -27,7 +28,7 @@ def write_tables(folder, runs):
 
 def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
     assert describe_study5(tmp_path)["runs"] == {"5a": 0, "5b": 0, "5c": 0}
-    write_tables(tmp_path, find_runs()[:-1])
+    write_tables(tmp_path, find_runs(STUDY5)[:-1])
     found = describe_study5(tmp_path)
     assert found["runs"] == {"5a": 216, "5b": 72, "5c": 143}
     assert set(found["comparisons"]) == {"interaction", "input_output less input"}
@@ -35,7 +36,7 @@ def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
 
 
 def test_effects_are_found_and_corrected_within_their_family(tmp_path):
-    write_tables(tmp_path, find_runs())
+    write_tables(tmp_path, find_runs(STUDY5))
     found = describe_study5(tmp_path)["comparisons"]
     expected = {"interaction": 0, "input_output less input": 20, "both with motion": 20}
     expected |= {"adding motion": 40, "erasing motion": -40, "remembering the action": 0}

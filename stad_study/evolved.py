@@ -1,0 +1,239 @@
+"""Runs that evolve one C in a kept world and score it: what studies 2 and 5 have in common.
+
+A world is the V and M of one seed and variant, in 16 bits. In the folder of a study each run has a
+folder of its own name, with the log of CMA-ES and the score. Whatever is there is not done again. A
+finished run is added to the tables, and its C to `networks`.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pandas
+import torch
+
+from stad_lab.config import Config
+from stad_lab.evaluation.statistics import FAILED
+from stad_lab.io.files import (
+    checksum,
+    checksum_of_arrays,
+    copy_file,
+    load_json,
+    load_tensors,
+    locked,
+    save_json,
+    save_tensors,
+)
+from stad_lab.training.evolution import LOG, evolve, read_log, resume
+from stad_lab.training.record import provenance
+from stad_study import tables
+from stad_study.networks import NETWORKS
+from stad_study.senses import Sense
+from stad_study.study import CARS, SCORE, STUDIES, WAIT, fixed_threads
+
+CHECKSUMS = ("log", "controller", "returns")
+
+
+class Run(Protocol):
+    """One C: a NamedTuple of a seed and what the study varies."""
+
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Its folder, below that of the study."""
+
+    @property
+    def config(self) -> Config:
+        """Its configuration."""
+
+    def _asdict(self) -> dict: ...
+
+
+@dataclass(frozen=True)
+class Evolved:
+    """A study of such runs."""
+
+    name: str  # of its folder, its tables and its folder of networks
+    parts: Callable[[Path], dict[str, list]]  # tables -> part -> runs, in the order of running
+    prepare: Callable[[Any, Path, Path], Sense]  # run, folder of the study, networks -> drives
+    keeps_logs: bool = False  # of runs that take hours, so that they can be continued elsewhere
+
+    @property
+    def key(self) -> list[str]:
+        """The columns that name a run in the tables."""
+        return tables.TABLES[f"{self.name}_runs"][0]
+
+
+def find_runs(
+    study: Evolved,
+    seeds: Sequence[int] | None = None,
+    only: Sequence[str] | None = None,
+    to: Path = tables.DATA,
+) -> list[Any]:
+    """The runs of a study, part by part. ValueError for an unknown seed or name."""
+    found = [run for runs in study.parts(to).values() for run in runs]
+    planned, names = {run.seed for run in found}, [run.name for run in found]
+    if other := set(seeds or ()) - planned:
+        known = f"{min(planned)} to {max(planned)}"
+        raise ValueError(f"{study.name} has no seed {min(other)}: it has {known}")
+    if unknown := [name for name in only or [] if name not in names]:
+        example = f"expected a name such as {names[0]!r}"
+        raise ValueError(f"{study.name} has no run {unknown[0]!r}: {example}")
+    found = [run for run in found if not seeds or run.seed in seeds]
+    return [run for run in found if not only or run.name in only]
+
+
+def count_runs(study: Evolved, to: Path = tables.DATA) -> dict[str, tuple[int, int]]:
+    """Part -> how many of its runs are in the tables, and how many there are to be."""
+    table = tables.read_or_empty(f"{study.name}_runs", to)
+    done = set(table[study.key].itertuples(index=False, name=None))
+    return {
+        part: (sum(tuple(run) in done for run in runs), len(runs))
+        for part, runs in study.parts(to).items()
+    }
+
+
+def describe_progress(study: Evolved, to: Path = tables.DATA) -> str:
+    """How many runs of each part are in the tables."""
+    told = [f"{part} {done} of {count}" for part, (done, count) in count_runs(study, to).items()]
+    return f"{study.name}: {', '.join(told)} runs are done"
+
+
+def run_evolved(
+    study: Evolved,
+    folder: str | Path,
+    seeds: Sequence[int] | None = None,
+    only: Sequence[str] | None = None,
+    to: Path = tables.DATA,
+    networks: Path = NETWORKS,
+) -> None:
+    """Run what is missing, in `folder/NAME`, and add each run to the tables in `to`.
+
+    After an interruption the same call continues. A run that another process does is left to it, so
+    several processes may share a folder; each computes on one thread. With `only`, runs that the
+    tables have are run, too, and compared. ValueError as `find_runs`.
+    """
+    root = Path(folder) / study.name
+    for run in find_runs(study, seeds, only, to):
+        if not only and recorded(study, run, to):
+            continue
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(locked(root / run.name))
+            except BlockingIOError:
+                continue
+            if not only and recorded(study, run, to):  # another process has just finished it
+                continue
+            print(f"{run.name}: {describe_progress(study, to)}", flush=True)
+            score = run_one(study, run, root, networks)
+            if only and (was := recorded(study, run, to)):
+                print(f"{run.name}: {compare(run, was, root)}", flush=True)
+                continue
+            add_run(study, run, root, to)
+            print(f"{run.name}: mean return {score['mean']:.1f}", flush=True)
+    print(describe_progress(study, to))
+
+
+def run_one(study: Evolved, run: Run, root: Path, networks: Path = NETWORKS) -> dict:
+    """Do what is missing of a run; returns its score."""
+    folder, kept = root / run.name, networks / study.name / run.name
+    if (folder / SCORE).exists():
+        return load_json(folder / SCORE, kind="score")
+    begin = time.perf_counter()
+    with fixed_threads():
+        sense = study.prepare(run, root, networks)
+        if study.keeps_logs and (kept / LOG).exists() and not (folder / LOG).exists():
+            copy_file(kept / LOG, folder)
+
+        def keep_log(generations: list[dict]) -> None:
+            if study.keeps_logs and "validation" in generations[-1]:
+                copy_file(folder / LOG, kept)
+
+        evolve(run.config, folder, watch=keep_log, drives=sense)  # type: ignore[arg-type]
+        log = read_log(run.config, folder, sense)  # type: ignore[arg-type]
+        controller = resume(run.config, folder, sense, log).controller().astype(np.float16)
+        score = score_controller(sense, controller)
+    seconds = time.perf_counter() - begin
+    made_with = provenance(
+        f"python -m stad_study replicate {study.name} --only {run.name} --out ..."
+    )
+    save_json(
+        folder / SCORE, {"kind": "score", "made_with": made_with, **score, "seconds": seconds}
+    )
+    return score
+
+
+def score_controller(sense: Sense, controller: np.ndarray) -> dict:
+    """Drive C, float16 (parameters,), on the tracks of study 1's score, in groups as there."""
+    tracks, limits = list(STUDIES["study1"].tracks), {"max_frames": STUDIES["study1"].max_frames}
+    parameters = controller.astype(np.float64)
+    groups = [tracks[start : start + CARS] for start in range(0, len(tracks), CARS)]
+    returns = np.concatenate([sense.drive(parameters, own, **limits).returns for own in groups])
+    return {
+        "mean": float(returns.mean()),
+        "returns": returns.tolist(),
+        "controller": controller.astype(float).tolist(),
+    }
+
+
+def add_run(study: Evolved, run: Run, root: Path, to: Path) -> None:
+    """Add a finished run to the tables: its line of runs, and its returns rounded to cents."""
+    score, key = load_json(root / run.name / SCORE, kind="score"), run._asdict()
+    tracks = STUDIES["study1"].tracks
+    returns = {str(t): round(one, 2) for t, one in zip(tracks, score["returns"], strict=True)}
+    line = pandas.DataFrame([key | describe_run(run, root)])
+    networks = to.parent / NETWORKS.name / study.name
+    with locked(networks, WAIT):
+        keep_controller(study, run, np.array(score["controller"]), networks)
+        tables.replace_lines(f"{study.name}_returns", pandas.DataFrame([key | returns]), to)
+        tables.replace_lines(f"{study.name}_runs", line, to)
+
+
+def describe_run(run: Run, root: Path) -> dict:
+    """The line of runs: score, learning curve, machine, seconds and checksums."""
+    score = load_json(root / run.name / SCORE, kind="score")
+    log = load_json(root / run.name / LOG)
+    returns = np.array(score["returns"])
+    line = {"mean": score["mean"], "below_800": float((returns < FAILED).mean())}
+    for entry in log["generations"]:
+        if "validation" in entry:
+            line[f"validation.{entry['generation']}"] = round(entry["validation"]["mean"], 2)
+    made = score["made_with"]
+    line |= {name: made[name] for name in ("commit", "processor", "numpy", "numba")}
+    line |= {"seconds": round(score["seconds"], 1)}
+    line["frames"] = sum(entry["frames"] for entry in log["generations"])
+    line["log"] = checksum((root / run.name / LOG).read_bytes())
+    line["controller"] = checksum_of_arrays(parameters=np.array(score["controller"], np.float16))
+    return line | {"returns": checksum_of_arrays(returns=returns)}
+
+
+def keep_controller(study: Evolved, run: Run, controller: np.ndarray, folder: Path) -> None:
+    """Add a C to the file of its seed: float16 (parameters,) under the name of the run."""
+    path = folder / f"seed{run.seed}.safetensors"
+    tensors = load_tensors(path)[0] if path.exists() else {}
+    tensors[run.name] = torch.from_numpy(controller.astype(np.float16))
+    save_tensors(path, dict(sorted(tensors.items())), kind="controllers", study=study.name)
+
+
+def recorded(study: Evolved, run: Run, to: Path = tables.DATA) -> dict | None:
+    """The line of a run in the table of runs; None if it is not there."""
+    table = tables.read_or_empty(f"{study.name}_runs", to)
+    own = table[(table[study.key] == list(run._asdict().values())).all(axis=1)]
+    return own.iloc[0].to_dict() if len(own) else None
+
+
+def compare(run: Run, was: dict, root: Path) -> str:
+    """Whether a run that was repeated is, bit by bit, the one in the tables."""
+    now = describe_run(run, root)
+    differs = [name for name in CHECKSUMS if was[name] != now[name]]
+    if not differs:
+        return "bit-identical to the recorded one, all returns, too"
+    where = f"recorded on {was['processor']}, here {now['processor']}"
+    return (
+        f"differs in {', '.join(differs)}: mean {was['mean']:.1f}, here {now['mean']:.1f}; {where}"
+    )
