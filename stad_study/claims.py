@@ -14,7 +14,7 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
 from stad_lab.training.record import total_budget
-from stad_study import measurements, study5_claims, study_claims, tables
+from stad_study import measurements, study2_claims, study5_claims, study_claims, tables
 from stad_study.experiments import BASELINE_DRIVERS, EXPERIMENTS
 
 CLAIMS = tables.DATA / "claims.json"
@@ -30,6 +30,7 @@ def compute_claims() -> dict[str, dict]:
     trained = [name for name in made if name in set(runs.query("role == 'world_model'").experiment)]
     return {
         "study1": study_claims.describe_study1(),
+        "study2": study2_claims.describe_study2(),
         "study3": study_claims.describe_study3(),
         "study5": study5_claims.describe_study5(),
         "agents": describe_agents(),

@@ -27,6 +27,7 @@ UNITS = ("agents", "episodes", "frames")
 RUN = ["experiment", "role", "seed"]
 PIPELINE = ["study", "variant", "features", "seed"]
 SENSED = ["seed", "variant", "sees", "repeat"]  # names a run of study 5
+BUDGET = ["seed", "variant", "episodes"]  # names a run of study 2
 TABLES = {  # name -> columns that name a line, and others that each line must have
     "episodes": (["experiment", "seed", "track"], ["return", "frames"]),
     "fast_episodes": (["agent", "processor", "track"], ["return", "frames"]),
@@ -43,6 +44,8 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
     "study_runs": (
         PIPELINE, ["processor", "world_model.trained_on", "dataset", "kept_controller"],
     ),
+    "study2_runs": (BUDGET, ["mean", "processor", "controller"]),
+    "study2_returns": (BUDGET, ["1000"]),
     "study5_runs": (SENSED, ["mean", "processor", "controller"]),
     "study5_returns": (SENSED, ["1000"]),
     "study_probe": ([*PIPELINE, "trained", "driver", "quantity"], ["r2"]),
@@ -176,7 +179,8 @@ def add_log(run: dict, log: list[dict], to: Path) -> None:
 
 def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
     """Write a table with new lines in the place of those of the same run or pipeline."""
-    run = [column for column in TABLES[name][0] if column in (*RUN, *PIPELINE, *SENSED)]
+    naming = {*RUN, *PIPELINE, *SENSED, *BUDGET}
+    run = [column for column in TABLES[name][0] if column in naming]
     if (folder / f"{name}.csv").exists():
         old = read(name, folder)
         new = pandas.MultiIndex.from_frame(lines[run])

@@ -1,0 +1,49 @@
+"""The outcome of study 2 that docs/protocol.md fixes, computed from its tables.
+
+The gate at a number of episodes is reported once all its runs are in the tables, and the comparison
+after the last run.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stad_study import tables
+from stad_study.evolved import count_runs
+from stad_study.study2 import GATE, SEEDS, STUDY2, has_passed
+from stad_study.study_claims import compare
+
+
+def describe_study2(folder: Path = tables.DATA) -> dict:
+    """Progress by part, "gate": episodes -> scores and whether it passed, and "comparison"."""
+    counts = count_runs(STUDY2, folder)
+    gates = {episodes: has_passed(episodes, folder) for episodes in GATE}
+    found: dict[str, Any] = {
+        "runs": {part: done for part, (done, _) in counts.items()},
+        "planned": {part: planned for part, (_, planned) in counts.items()},
+        "gate": {
+            str(episodes): {"scores": scores_of("frame", episodes, folder), "passed": passed}
+            for episodes, passed in gates.items()
+            if passed is not None
+        },
+    }
+    after = counts.get("after the gate")
+    passed = [episodes for episodes in (1, 4) if gates[episodes]]
+    if passed and after and after[0] == after[1]:
+        pair = [returns_of(variant, passed[0], folder) for variant in ("frame", "input_output")]
+        found["comparison"] = compare(*pair) | {"episodes": passed[0]}
+    return found
+
+
+def scores_of(variant: str, episodes: int, folder: Path) -> list[float]:
+    """The scores of the gate's runs, seed by seed."""
+    table = tables.read("study2_runs", folder).set_index(tables.BUDGET)["mean"]
+    return [float(table.loc[(seed, variant, episodes)]) for seed in GATE[episodes]]
+
+
+def returns_of(variant: str, episodes: int, folder: Path) -> np.ndarray:
+    """Returns (seeds, tracks) of the runs of a variant."""
+    table = tables.read("study2_returns", folder).set_index(tables.BUDGET)
+    table = table[[column for column in table if column.isdigit()]]
+    return np.array([table.loc[(seed, variant, episodes)] for seed in SEEDS])

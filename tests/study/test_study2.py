@@ -1,0 +1,86 @@
+"""Study 2: the gate decides what runs, and a long run can be continued elsewhere."""
+
+import dataclasses
+
+import numpy as np
+import pandas
+import pytest
+
+from stad_lab.config import Config
+from stad_lab.io.files import load_json
+from stad_lab.training.evolution import LOG
+from stad_study import evolved, study2, tables
+from stad_study.evolved import count_runs, find_runs, run_evolved
+from stad_study.study import STUDIES
+from stad_study.study2 import STUDY2, Run
+from stad_study.study2_claims import describe_study2
+
+ONE, FOUR = ([Run(seed, "frame", episodes) for seed in (300, 301)] for episodes in (1, 4))
+SIXTEEN = [Run(300, "frame", 16)]
+
+
+def write_tables(folder, scores):
+    """Tables of runs, each with its score on 20 tracks."""
+    rng, lines = np.random.default_rng(0), []
+    for run, score in scores.items():
+        returns = score + rng.normal(0, 1, 20)
+        columns = {str(1000 + track): one for track, one in enumerate(returns)}
+        made = {"mean": score, "processor": "a CPU", "controller": "c"}
+        lines.append(run._asdict() | columns | made)
+    for name in ("runs", "returns"):
+        tables.save(f"study2_{name}", pandas.DataFrame(lines), folder)
+
+
+def test_the_gate_decides_what_runs(tmp_path):
+    assert find_runs(STUDY2, to=tmp_path) == FOUR + ONE
+    write_tables(tmp_path, dict.fromkeys(FOUR, 800.0))
+    assert find_runs(STUDY2, to=tmp_path) == FOUR + ONE  # 1 episode is tried before it is decided
+    write_tables(tmp_path, {FOUR[0]: 900.0, FOUR[1]: 779.0})
+    assert find_runs(STUDY2, to=tmp_path) == FOUR + ONE + SIXTEEN
+    write_tables(tmp_path, dict.fromkeys(FOUR, 800.0) | dict.fromkeys(ONE, 700.0))
+    after = find_runs(STUDY2, to=tmp_path)[4:]
+    assert {run.episodes for run in after} == {4}
+    counts = pandas.Series([run.variant for run in FOUR + after]).value_counts()
+    assert counts.to_dict() == {"frame": 5, "input_output": 5, "input": 2, "output": 2}
+    write_tables(tmp_path, dict.fromkeys(FOUR + ONE, 500.0) | dict.fromkeys(SIXTEEN, 850.0))
+    after = find_runs(STUDY2, to=tmp_path)[5:]
+    counts = pandas.Series([run.variant for run in SIXTEEN + after]).value_counts()
+    assert counts.to_dict() == {"frame": 2, "input_output": 2}
+
+
+def test_the_comparison_waits_for_the_last_run(tmp_path):
+    scores = dict.fromkeys(FOUR, 800.0) | dict.fromkeys(ONE, 700.0)
+    write_tables(tmp_path, scores)
+    for run in find_runs(STUDY2, to=tmp_path)[4:]:
+        scores[run] = 840.0 if run.variant == "input_output" else 800.0
+    write_tables(tmp_path, dict(list(scores.items())[:-1]))
+    found = describe_study2(tmp_path)
+    assert found["gate"]["4"]["passed"] and not found["gate"]["1"]["passed"]
+    assert "comparison" not in found
+    write_tables(tmp_path, scores)
+    found = describe_study2(tmp_path)["comparison"]
+    assert found["difference"] == pytest.approx(40, abs=2) and found["episodes"] == 4
+
+
+def quick(generations):
+    """A budget of seconds."""
+    evolution = {"generations": generations, "validate_every": 2, "max_frames": 15}
+    return Config.preset("quick", processes=1, evolution=evolution)
+
+
+def test_a_run_continues_from_the_log_that_is_kept_of_it(tmp_path, monkeypatch, capsys):
+    short = dataclasses.replace(STUDIES["study1"], tracks=range(1000, 1004), max_frames=20)
+    monkeypatch.setitem(STUDIES, "study1", short)
+    run, networks = FOUR[0], tmp_path / "networks"
+    monkeypatch.setattr(study2, "CONFIG", quick(2))
+    evolved.run_one(STUDY2, run, tmp_path / "stopped", networks)
+    kept = networks / "study2" / run.name / LOG
+    assert np.shape(load_json(kept)["generations"][1]["returns"]) == (4, 4)  # candidates, episodes
+    monkeypatch.setattr(study2, "CONFIG", quick(4))
+    to = {"only": [run.name], "to": tmp_path / "data", "networks": networks}
+    run_evolved(STUDY2, tmp_path / "elsewhere", **to)
+    assert "evolve C (frame):  50%" in capsys.readouterr().err
+    assert count_runs(STUDY2, tmp_path / "data")["gate, 4 each"] == (1, 2)
+    kept.unlink()
+    run_evolved(STUDY2, tmp_path / "whole", **to)
+    assert "bit-identical" in capsys.readouterr().out
