@@ -134,6 +134,14 @@ def test_until_stops_after_a_stage_and_an_option_changes_a_field(tmp_path, capsy
     assert found == Config.preset("quick", variant="frame", data=data, vae=vae)
 
 
+def test_a_new_run_with_a_dataset_that_is_there_has_a_record(tmp_path, capsys):
+    shared = ["--until", "dataset", "--dataset", str(tmp_path / "shared")]
+    for run in ("first", "second"):
+        assert call(*train_quickly(tmp_path / run, *shared, "--data.episodes", "2")) == 0
+    assert "dataset: already there" in capsys.readouterr().out
+    assert load_json(tmp_path / "second/record.json")["config"]["data"]["episodes"] == 2
+
+
 def test_a_start_that_was_refused_may_be_made_again_with_other_settings(
     tmp_path, monkeypatch, capsys
 ):

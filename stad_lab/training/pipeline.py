@@ -181,8 +181,9 @@ def run_stages(
             print(f"{name}: {'done' if did else 'already there, nothing to do'}", flush=True)
             worked |= did
         record["budget"] = budget(config, folder, data)
-        if worked or load_json(folder / RECORD) != record:
-            save_json(folder / RECORD, record)
+        path = folder / RECORD
+        if worked or not path.exists() or load_json(path) != record:
+            save_json(path, record)
     return worked
 
 
