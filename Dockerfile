@@ -14,7 +14,7 @@ WORKDIR /home/driver/stad_lab
 RUN python -m venv .venv \
     && .venv/bin/pip install --no-cache-dir torch==2.13.0 --index-url https://download.pytorch.org/whl/cpu
 COPY --chown=driver . .
-RUN .venv/bin/pip install --no-cache-dir -r environment.txt && .venv/bin/python -m stad_lab check
+RUN .venv/bin/pip install --no-cache-dir -r environment.txt && .venv/bin/python -m stad_course doctor
 
 ENV PATH=/home/driver/stad_lab/.venv/bin:$PATH
 EXPOSE 8888

@@ -33,7 +33,7 @@ from stad_study.figures import (
 from stad_study.study_claims import FAMILIES, FEATURES, MARGIN
 from stad_study.verdict import PAPER_GAIN, describe_meaning, describe_verdict
 
-PACKAGE = Path(config.__file__).parent
+ROOT = Path(__file__).parent.parent
 AGENTS = (*config.VARIANTS, "cropped_input")
 TAB_SPEED = Path(__file__).parent / "live" / "engine" / "speed.json"
 
@@ -429,19 +429,17 @@ def modules_list(claims: dict) -> str:
 
 def modules() -> list[str]:
     """All modules: the library's, lower layers first as in pyproject.toml, and those beside it."""
-    settings = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text("utf-8"))
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
     layers = settings["tool"]["importlinter"]["contracts"][0]["layers"]
     place = {part: -height for height, one in enumerate(layers) for part in re.findall(r"\w+", one)}
-    files = [file.relative_to(PACKAGE).with_suffix("") for file in PACKAGE.rglob("*.py")]
-    names = [".".join(file.parts) for file in files if not file.name.startswith("__")]
-    order = sorted(names, key=lambda name: (place[name.split(".")[0]], name))
-    beside = [
-        ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts)
-        for package in ("stad_course", "stad_study")
-        for file in sorted((PACKAGE.parent / package).rglob("*.py"))
-        if not file.name.startswith("__")
-    ]
-    return [*(f"stad_lab.{name}" for name in order), *beside]
+    library = sorted(modules_of("stad_lab"), key=lambda name: place[name.split(".")[1]])
+    return [*library, *modules_of("stad_course"), *modules_of("stad_study")]
+
+
+def modules_of(package: str) -> list[str]:
+    """The modules of a package, by their whole names."""
+    files = [file for file in (ROOT / package).rglob("*.py") if not file.name.startswith("__")]
+    return sorted(".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files)
 
 
 def gallery(claims: dict) -> str:

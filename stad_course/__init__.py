@@ -1,1 +1,1 @@
-"""What a course adds: predictions and quizzes, checks of the exercises, and a competition."""
+"""What a course adds: a test of machines, driving by hand, quizzes, checks and a competition."""

@@ -1,6 +1,16 @@
 """`python -m stad_course`: the command line of `stad_course.cli`."""
 
-from stad_lab.streams import run_program
+import io
+import sys
+
+from stad_lab.streams import open_missing_streams, run_program
 
 if __name__ == "__main__":
+    if sys.argv[1:] == ["doctor"]:  # it must run where the command line's own packages are missing
+        open_missing_streams()
+        from stad_course.doctor import tell_environment
+
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")  # for letters that a console lacks
+        sys.exit(tell_environment())
     run_program("stad_course", progress=())

@@ -15,6 +15,13 @@ def main(arguments: list[str] | None = None) -> int:
     return command_line.run(PROGRAM, arguments)
 
 
+def doctor() -> int:
+    """Say whether everything is installed, and what to do about what is not."""
+    from stad_course.doctor import tell_environment
+
+    return tell_environment()
+
+
 def kit(file: tyro.conf.Positional[Path]) -> None:
     """Write a first agent to a file, to begin from.
 
@@ -83,6 +90,7 @@ def compete(
 
 
 COMMANDS: dict[str, Callable] = {
+    "doctor": doctor,
     "kit": kit,
     "check": check,
     "commit": commit,

@@ -16,15 +16,14 @@ from stad_lab.registration import register_when_used
 HOMES = {
     "Agent": "agent",
     "Config": "config",
-    "check_environment": "doctor",
     "load_agent": "agent",
     "make_env": "envs.car_racing",
 }
-__all__ = ["Agent", "Config", "check_environment", "load_agent", "make_env"]
+__all__ = ["Agent", "Config", "load_agent", "make_env"]
 
 
 def __getattr__(name: str):
-    """Import a public name when it is first used: `check_environment` runs without PyTorch."""
+    """Import a public name when it is first used: `make_env` runs without PyTorch."""
     if name not in HOMES:
         raise AttributeError(f"module 'stad_lab' has no attribute {name!r}")
     try:

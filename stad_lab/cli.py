@@ -1,7 +1,7 @@
 """The command line, `python -m stad_lab COMMAND`.
 
 Each function below is a command: its arguments are the options, and their descriptions the help.
-What a command needs is imported when it is called, so that `check` runs where PyTorch does not.
+What a command needs is imported when it is called, so that the help does not wait for PyTorch.
 """
 
 import itertools
@@ -59,13 +59,6 @@ def result_file(file: Path | None, source: str, kind: str, details: str = "") ->
     file = file or (Path(name) if run.parent == PRETRAINED else run / name)
     check_output(file)
     return file
-
-
-def check() -> int:
-    """Say whether everything is installed, and what to do about what is not."""
-    from stad_lab.doctor import tell_environment
-
-    return tell_environment()
 
 
 def training_command(config: Config) -> Callable:
@@ -282,7 +275,6 @@ def film(agent: str, out: str, track: int = 5, first: int = 60, frames: int = 24
 
 
 COMMANDS: dict[str, Callable] = {
-    "check": check,
     "train": training_command(PRESETS["laptop"]),
     "fine-tune": fine_tune,
     "evaluate": evaluate,

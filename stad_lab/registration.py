@@ -11,7 +11,8 @@ from types import ModuleType
 def register_environments() -> None:
     """Register by the names of our modules, which Gymnasium imports when an environment is made.
 
-    Without a working Gymnasium the doctor must still run: it reports what is wrong.
+    Without a working Gymnasium the import must still succeed: `stad_course.doctor` says what is
+    wrong.
     """
     with contextlib.suppress(Exception):
         from gymnasium import register

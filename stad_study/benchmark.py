@@ -37,7 +37,6 @@ from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import FrameMemory
 from stad_lab.envs.vector import CarRacingVector
 from stad_lab.evaluation.evaluate import evaluate
-from stad_lab.evaluation.parity import AREAS, compare_pictures
 from stad_lab.inference import Inference
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.workers import run_in_order, single_thread, worker_processes, worker_threads
@@ -51,6 +50,7 @@ from stad_lab.training.pipeline import STAGES, train
 from stad_lab.training.record import RECORD, provenance
 from stad_lab.training.trainer import Training, read_ahead, update
 from stad_lab.training.vae import vae_training
+from stad_study.parity import AREAS, compare_pictures
 
 SOURCE = "input"  # the shipped agent that drives, and the variant that is trained
 PRESET = "laptop"  # of the whole run

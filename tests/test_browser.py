@@ -189,8 +189,8 @@ def test_source_is_readable_in_the_dark_theme_and_a_slider_changes_every_figure(
 
 SEAT = """
 from stad_lab import load_agent
-from stad_lab.play.session import Session
-from stad_lab.play.widget import drive_yourself
+from stad_course.play.session import Session
+from stad_course.play.widget import drive_yourself
 session = Session(load_agent("cropped_input"), track=1)
 drive_yourself(session)
 """
@@ -263,8 +263,8 @@ def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(r
 
 DRIVEN = """
 from stad_lab import load_agent
-from stad_lab.play.session import Session
-from stad_lab.play.widget import drive_yourself
+from stad_course.play.session import Session
+from stad_course.play.widget import drive_yourself
 session = Session(load_agent("input"), track=1)
 for _ in range(frames):
     session.step()

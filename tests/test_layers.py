@@ -119,6 +119,12 @@ def test_a_student_can_read_the_core_in_an_evening():
     assert lines(CORE) <= 1500, f"the core has {lines(CORE)} lines"
 
 
+def test_the_library_without_its_engine_stays_small():
+    engine = [*(PACKAGE / "envs").glob("*.py"), PACKAGE / "inference.py"]
+    library = lines(PACKAGE.rglob("*.py")) - lines(engine)
+    assert library <= 7000, f"the library has {library} lines"
+
+
 def test_the_architecture_of_v_and_m_is_read_from_a_configuration_in_one_place():
     """A new setting of V or M needs its network and nothing else: the rest calls `of`."""
     calls = [

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
+from stad_course.play.session import Hand
 from stad_lab.agent import load_agent
 from stad_lab.config import VARIANTS
 from stad_lab.models.controller import control
 from stad_lab.models.vae import to_array, to_tensor
-from stad_lab.play.session import Hand
 
 LIVE = Path(__file__).parent.parent / "docs" / "live"
 

@@ -15,6 +15,21 @@ def codes() -> torch.Tensor:
     return torch.randn(3, 6, 32, generator=torch.Generator().manual_seed(1))
 
 
+def check_gradients(
+    what: str, answer: Callable, given: tuple, right: torch.Tensor, mistakes: dict
+) -> None:
+    """Check a function of mu, logvar and more: its values, and the gradients of mu and logvar."""
+    mu, logvar, *others = given
+    leaves = {"mu": mu.clone().requires_grad_(), "logvar": logvar.clone().requires_grad_()}
+    found = ask(what, answer, *leaves.values(), *others)
+    check(what, found, right, mistakes)
+    if found.requires_grad:
+        found.sum().backward()
+    if lost := [name for name, leaf in leaves.items() if leaf.grad is None]:
+        remedy = "then nothing is learned through it: do not detach, and avoid NumPy and no_grad()"
+        raise WrongAnswer(what, f"no gradient comes back to {' and '.join(lost)}", remedy)
+
+
 def kl_values(kl: Callable) -> None:
     """The KL divergence of six pictures, in nats."""
     mu, logvar, _ = codes()
@@ -40,12 +55,7 @@ def kl_values(kl: Callable) -> None:
         "this is the sum over all pictures too: keep one number for each": each.sum(),
         "this is the mean over all pictures: keep one number for each": right.mean(),
     }
-    what, leaves = "kl(mu, logvar)", (mu.clone().requires_grad_(), logvar.clone().requires_grad_())
-    found = ask(what, kl, *leaves)
-    check(what, found, right, mistakes)
-    if not found.requires_grad:
-        remedy = "then training cannot lower it: do not detach, and stay with PyTorch"
-        raise WrongAnswer(what, "no gradient comes back from it", remedy)
+    check_gradients("kl(mu, logvar)", kl, (mu, logvar), right, mistakes)
 
 
 def reparameterise_values(reparameterise: Callable) -> None:
@@ -64,18 +74,9 @@ def reparameterise_values(reparameterise: Callable) -> None:
         "mu and noise are exchanged: it is the noise that sigma scales": noise + sigma * mu,
         "this noise was sampled by you: use the one that is given": mu + sigma * own,
     }
-    leaves = [mu.clone().requires_grad_(), logvar.clone().requires_grad_()]
+    right = mu + sigma * noise
     torch.manual_seed(0)
-    z = ask(what, reparameterise, *leaves, noise)
-    check(what, z, mu + sigma * noise, mistakes)
-    if not z.requires_grad:
-        remedy = "do not detach, and do not sample inside torch.no_grad()"
-        raise WrongAnswer(what, "no gradient comes back from z", remedy)
-    z.sum().backward()
-    for name, leaf in zip(("mu", "logvar"), leaves, strict=True):
-        if leaf.grad is None:
-            remedy = "then the encoder cannot learn it"
-            raise WrongAnswer(what, f"no gradient reaches {name}", remedy)
+    check_gradients(what, reparameterise, (mu, logvar, noise), right, mistakes)
     print("gradients reach mu and logvar, though z is a sample")
 
 

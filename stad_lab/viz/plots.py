@@ -5,7 +5,7 @@ which colour-blind readers can distinguish; difference images share a diverging 
 """
 
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from itertools import cycle, product
 from typing import Any
 
@@ -15,9 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
-from matplotlib.patches import Ellipse
 
-from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.evaluation.trajectories import MOTION, Inspection, Trajectory
 
@@ -127,77 +125,6 @@ def plot_pictures(
     return describe(figure, title, lead, columns)
 
 
-def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
-    """The car's speed at the end of every episode, and for each stride the mean `|d|` there."""
-    figure, ((axis,),) = new_figure(6.5, 3.6)
-    for (stride, values), color in zip(change.items(), cycle(COLORS), strict=False):
-        label = f"stride {stride}: correlation {np.corrcoef(speed, values)[0, 1]:.2f}"
-        axis.scatter(speed, values, s=8, color=color, alpha=0.6, label=label)
-    axis.set(xlabel="true speed (world units per second)", ylabel="mean |d| of the frame")
-    axis.legend(frameon=False)
-    title = "The difference image grows with speed, and with the stride"
-    lead = "One point for every episode and stride; strides "
-    return describe(figure, title, lead, map(str, change))
-
-
-def plot_paths(
-    road: np.ndarray, paths: dict[str, tuple[np.ndarray, np.ndarray]], title: str
-) -> Figure:
-    """Driven paths on the road, from above, one panel each.
-
-    Args:
-        road: centres of its tiles, world units (tiles, 2).
-        paths: name -> (where the car was, world units (T, 2); whether the human drove, bool (T,)).
-    """
-    figure, axes = new_figure(max(3.4 * len(paths), 5.0), 3.9, 1, len(paths))
-    left, right = road_edges(road)
-    points = np.concatenate([own for own, _ in paths.values()])
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle, reach = (low + high) / 2, (high - low).max() / 2 + 2 * TRACK_WIDTH
-    for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
-        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85")
-        drivers = ("agent", ~by_hand, BLUE, 4), ("you, by hand", by_hand, ORANGE, 12)
-        for driver, shown, color, size in drivers:
-            if shown.any():
-                axis.scatter(*points[shown].T, label=driver, color=color, s=size)
-        axis.plot(*points[0], "^", color="black", ms=7, label="start")
-        axis.plot(*points[-1], "x", color="black", ms=7, label="end")
-        caption(axis, name, "world units")
-        (x, y), far = middle, np.array([-reach, reach])
-        axis.set(xlim=x + far, ylim=y + far, aspect="equal")
-        axis.legend(frameon=False, fontsize=8)
-    axes[0, 0].set_ylabel("world units")
-    ends = [f"{name}: {len(own)} frames, {own.sum()} by hand" for name, (_, own) in paths.items()]
-    return describe(figure, title, "The car's path on the road, from above. ", ends)
-
-
-def plot_road(
-    road: np.ndarray, paths: dict[str, np.ndarray], title: str, center: int, reach: float
-) -> Figure:
-    """A lap from above and a part of it enlarged, with the paths of cars.
-
-    Args:
-        road: centres of its tiles, world units (tiles, 2).
-        paths: name -> position of a car in every frame, world units (T, 2).
-        center: the tile around which the second panel is drawn.
-        reach: how far that panel extends to each side, world units.
-    """
-    figure, axes = new_figure(8.6, 4.3, 1, 2)
-    left, right = road_edges(road)
-    for axis in axes[0]:
-        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85", label="road")
-        for (name, path), (color, dash) in zip(paths.items(), STYLES, strict=False):
-            axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
-            axis.plot(*path[-1], "x", color=color, ms=7)
-        axis.set(xlabel="world units", aspect="equal")
-    axes[0, 0].set(ylabel="world units", title="the lap (x: end of an episode)")
-    (x, y), far = road[center], np.array([-reach, reach])
-    axes[0, 1].set(xlim=x + far, ylim=y + far, title=f"around tile {center}")
-    axes[0, 1].legend(fontsize=8)
-    lead = f"A lap of {len(road)} tiles from above, and enlarged around tile {center}: "
-    return describe(figure, title, f"{lead}the paths of ", paths)
-
-
 def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> Figure:
     """Frame `moment` of an episode: pictures, latents, prediction, action, and the return so far.
 
@@ -245,7 +172,7 @@ def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> 
     return describe(figure, f"{title}, reward {earned:+.1f}", content)
 
 
-# V and M
+# V, M and C
 
 
 def plot_history(history: list[dict], title: str, unit: str) -> Figure:
@@ -256,33 +183,6 @@ def plot_history(history: list[dict], title: str, unit: str) -> Figure:
     )
     losses = {"train": train, "held-out": heldout}
     return plot_curves(losses, title, "training step", f"loss ({unit})", x=steps, marker=".")
-
-
-def plot_bars(values: dict[str, np.ndarray], title: str, xlabel: str, ylabel: str) -> Figure:
-    """Sorted values, a panel for each name: for example the KL of every latent dimension."""
-    figure, axes = new_figure(2.1 * len(values) + 0.6, 2.7, 1, len(values), sharey=True)
-    for (name, array), axis, color in zip(values.items(), axes[0], cycle(COLORS), strict=False):
-        axis.bar(np.arange(len(array)), np.sort(array)[::-1], color=color, width=0.9)
-        caption(axis, name, xlabel)
-    axes[0, 0].set_ylabel(ylabel)
-    ranges = [f"{name} from {max(own):.3g} to {min(own):.3g}" for name, own in values.items()]
-    return describe(figure, title, "Bars sorted from high to low: ", ranges)
-
-
-def plot_rate_distortion(
-    rates: np.ndarray, errors: np.ndarray, names: list[str], title: str
-) -> Figure:
-    """Rate (KL, nats) against distortion (squared error), a named point for each V."""
-    figure, ((axis,),) = new_figure(6.5, 3.4)
-    axis.plot(rates, errors, "o-", color=BLUE)
-    axis.set(xlabel="rate: KL (nats)", ylabel="distortion: squared error")
-    axis.margins(0.18)
-    values = []
-    for name, rate, error in zip(names, rates, errors, strict=True):
-        place = {"xytext": (6, 6), "textcoords": "offset points"}
-        axis.annotate(name, (rate, error), fontsize=9, **place)
-        values.append(f"{name} {rate:.0f} nats, {error:.0f}")
-    return describe(figure, title, "Points: ", values)
 
 
 def plot_scatter(
@@ -308,34 +208,6 @@ def plot_scatter(
     return describe(figure, title, "Panels: ", counts)
 
 
-def plot_mixture(
-    logpi: np.ndarray,
-    mean: np.ndarray,
-    logsigma: np.ndarray,
-    temperatures: list[float],
-    actual: float | None = None,
-) -> Figure:
-    """The density of a mixture, each array (mixtures,), at some temperatures."""
-    figure, ((axis,),) = new_figure(6.5, 3.4)
-    reach = 4 * np.exp(logsigma) * np.sqrt(max(temperatures))
-    z = np.linspace((mean - reach).min(), (mean + reach).max(), 600)
-    for temperature, (color, dash) in zip(temperatures, cycle(STYLES), strict=False):
-        weights = np.exp((logpi - logpi.max()) / temperature)
-        weights /= weights.sum()
-        sigma = np.exp(logsigma) * np.sqrt(temperature)
-        gaussians = np.exp(-0.5 * ((z[:, None] - mean) / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
-        label = f"temperature {temperature:g}"
-        axis.plot(z, gaussians @ weights, dash, color=color, lw=2, label=label)
-        if len(temperatures) == 1:
-            axis.plot(z, weights * gaussians, **THIN)
-    if actual is not None:
-        axis.axvline(actual, color=RED, ls="--", lw=1.5, label="actual value")
-    axis.set(xlabel="next value of the latent", ylabel="probability density", ylim=(0, None))
-    axis.legend(frameon=False)
-    lead, chosen = "Density of the mixture at temperature ", (f"{one:g}" for one in temperatures)
-    return describe(figure, "M's prediction for one latent", lead, chosen)
-
-
 def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> Figure:
     """Histograms of numbers in [0, 1] as outlines; shares (bins,) are scaled so that 1 is uniform.
 
@@ -352,47 +224,6 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
     axis.legend(**SMALL)
     ranges = [f"{name} {min(own):.2g} to {max(own):.2g}" for name, own in scaled.items()]
     return describe(figure, title, "Histograms relative to uniform, 1: ", ranges)
-
-
-# CMA-ES
-
-
-def plot_cma_es(
-    landscape: Callable[[np.ndarray], np.ndarray],
-    generations: list[dict],
-    shown: list[int],
-    title: str = "Population (dots), mean (cross) and one-sigma ellipse of CMA-ES",
-) -> Figure:
-    """CMA-ES on a function of two variables: population and one-sigma ellipse of generations.
-
-    Args:
-        landscape: function of an array (..., 2), to be minimised.
-        generations: each {"population" (n, 2), "mean" (2,), "covariance" (2, 2)}, the covariance
-            with sigma squared.
-        shown: indices of the generations to draw, one panel each.
-    """
-    size, reach = (2.5 * len(shown) + 0.5, 3.5), 4.0  # the panels show [-4, 4] in both variables
-    figure, axes = new_figure(*size, 1, len(shown), sharex=True, sharey=True)
-    x = np.linspace(-reach, reach, 121)
-    height = landscape(np.stack(np.meshgrid(x, x), axis=-1))
-    dots = {"s": 16, "color": ORANGE, "edgecolor": "black", "lw": 0.4, "zorder": 3}
-    outline = {"fill": False, "ec": SKY, "lw": 2.5, "zorder": 4}
-    for index, axis in zip(shown, axes[0], strict=True):
-        generation, mean = generations[index], generations[index]["mean"]
-        axis.contourf(x, x, np.log(height - height.min() + 1e-2), 18, cmap="Greys_r", alpha=0.8)
-        axis.scatter(*generation["population"].T, **dots)
-        values, vectors = np.linalg.eigh(generation["covariance"])
-        tilt = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
-        thickness, width = 2 * np.sqrt(values)
-        axis.add_patch(Ellipse(mean, width, thickness, angle=tilt, **outline))
-        axis.plot(*mean, "+", color=RED, ms=10, mew=2, zorder=5)
-        axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
-        caption(axis, f"generation {index + 1}", "x")
-    axes[0, 0].set_ylabel("y")
-    describe(figure, title, "Generations ", (str(index + 1) for index in shown))
-    if len(shown) < 3:
-        figure.suptitle("Population, mean, ellipse", fontsize=11)  # for a narrow figure
-    return figure
 
 
 def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str) -> Figure:
@@ -414,32 +245,6 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
     axis.legend(**SMALL)
     last = [f"{name} {value:.0f}" for name, value in zip(names, curves[:, -1], strict=True)]
     return describe(figure, title, f"In the last of {curves.shape[1]} generations: ", last)
-
-
-def plot_episodes(
-    runs: dict[str, list[tuple[np.ndarray, np.ndarray]]],
-    published: dict[str, dict[int, float]],
-    title: str,
-) -> Figure:
-    """Sample efficiency: score against the episodes driven for it, on a logarithmic axis.
-
-    Args:
-        runs: name -> for every seed its episodes and its scores at those.
-        published: name -> episodes -> score, as others have reported: points without a line.
-    """
-    figure, ((axis,),) = new_figure(8.0, 4.2 + 0.08 * len(runs))
-    last = []
-    for (name, seeds), (color, dash) in zip(runs.items(), cycle(STYLES), strict=False):
-        for episodes, scores in seeds:
-            (line,) = axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8)
-        line.set_label(name)
-        last.append(f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}")
-    for (name, points), marker in zip(published.items(), MARKERS, strict=False):
-        axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
-    axis.axhline(SOLVED, **THIN)
-    axis.set(xscale="log", xlabel="episodes (logarithmic)", ylabel="score", ylim=(None, 960))
-    legend_below(figure, axis)  # inside the axis, many names would hide the points
-    return describe(figure, title, "At the end, mean of the seeds: ", last)
 
 
 # Results
@@ -569,122 +374,3 @@ def plot_intervals(
             axes[0, 0].plot([], [], mark, color=color, label=name)
         legend_below(figure, axes[0, 0])
     return describe(figure, title, "; ".join(values))
-
-
-# Candidates on the map
-
-
-def road_edges(road: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both edges of a lap, closed: centres of its tiles (tiles, 2) -> (tiles + 1, 2) each."""
-    along = np.roll(road, -1, axis=0) - np.roll(road, 1, axis=0)
-    across = TRACK_WIDTH * along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1, keepdims=True)
-    left, right = (np.concatenate([edge, edge[:1]]) for edge in (road + across, road - across))
-    return left, right
-
-
-def draw_map(axis: Axes, road: np.ndarray, paths: list[np.ndarray], returns: np.ndarray) -> None:
-    """A lap from above with the path of each car: the best in ORANGE, the others in BLUE."""
-    left, right = road_edges(road)
-    axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.87")
-    best = int(np.argmax(returns))
-    for place, path in enumerate(paths):
-        if place != best:
-            axis.plot(*path.T, color=BLUE, lw=1.0, alpha=0.6)
-            axis.plot(*path[-1], ".", color=BLUE, ms=5)
-    axis.plot(*paths[best].T, color=ORANGE, lw=2.2)
-    axis.plot(*paths[best][-1], ".", color=ORANGE, ms=9)
-    axis.plot(*road[0], "^", color="black", ms=7)
-    low, high = road.min(axis=0) - 35, road.max(axis=0) + 35  # a car may end far in the grass
-    axis.set(xticks=[], yticks=[], aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    axis.spines[:].set_visible(False)
-
-
-def plot_maps(maps: dict[str, tuple], title: str) -> Figure:
-    """Laps from above: name -> (road (tiles, 2), paths of cars (T, 2) each, returns (cars,))."""
-    rows = -(-len(maps) // 5)
-    columns = -(-len(maps) // rows)
-    figure, axes = new_figure(min(2.6 * columns, 10.5) + 0.2, 2.9 * rows + 0.4, rows, columns)
-    for axis, (name, (road, paths, returns)) in zip(axes.flat, maps.items(), strict=False):
-        draw_map(axis, road, paths, returns)
-        caption(axis, f"{name}: best {returns.max():.0f}" if len(returns) > 1 else name)
-    for axis in axes.flat[len(maps) :]:
-        axis.set_visible(False)
-    bests = [f"{name}, best return {own[2].max():.0f}" for name, own in maps.items()]
-    return describe(figure, title, "Laps from above (triangle: start, dot: end). ", bests)
-
-
-def plot_learning(generations: list[dict], total: int, title: str) -> Figure:
-    """The last generation on its map, beside the returns of all so far.
-
-    Args:
-        generations: each {"road", "paths", "returns"} as `plot_maps` takes them.
-        total: generations of the whole run, the width of the axis.
-    """
-    figure, axes = new_figure(9.4, 4.2, 1, 2, width_ratios=[1, 1.25])
-    last, number = generations[-1], np.arange(1, len(generations) + 1)
-    draw_map(axes[0, 0], last["road"], last["paths"], last["returns"])
-    caption(axes[0, 0], f"generation {len(generations)}: all candidates (orange: the best)")
-    axis = axes[0, 1]
-    returns = np.array([own["returns"] for own in generations])
-    axis.plot(number, returns, ".", color=BLUE, ms=3, alpha=0.5)
-    axis.plot(number, returns.max(axis=1), color=ORANGE, lw=1.6, label="best candidate")
-    axis.plot(number, returns.mean(axis=1), color=BLUE, lw=2.2, label="average candidate")
-    axis.axhline(SOLVED, **THIN, label=f"{SOLVED} points")
-    axis.set(xlabel="generation", ylabel="return of an episode", xlim=(0.5, total + 0.5))
-    axis.set_ylim(min(-20, returns.min() - 20), 960)
-    legend_below(figure, axis)
-    means = f"average return {returns[0].mean():.0f} at first, {returns[-1].mean():.0f} at last"
-    return describe(figure, title, f"{len(generations)} generations: {means}")
-
-
-def plot_ranks(ranks: dict[str, np.ndarray], title: str) -> Figure:
-    """Ranks of the same candidates in several contests: name -> ranks (candidates,), 1 the best.
-
-    A line for each candidate; the winner of the first contest is ORANGE.
-    """
-    figure, ((axis,),) = new_figure(6.5, 3.6)
-    table = np.array(list(ranks.values()))
-    winner = int(table[0].argmin())
-    for candidate in range(table.shape[1]):
-        if candidate != winner:
-            axis.plot(table[:, candidate], "o-", color=BLUE, alpha=0.35, ms=4)
-    label = "who won on the first"
-    axis.plot(table[:, winner], "o-", color=ORANGE, lw=2.5, ms=7, label=label)
-    axis.set(xticks=range(len(ranks)), xticklabels=list(ranks), ylabel="rank (1: the best)")
-    axis.set_ylim(table.max() + 1, 0)
-    legend_below(figure, axis)
-    places = [f"{name} rank {own[winner]}" for name, own in ranks.items()]
-    return describe(figure, title, "The winner of the first: ", places)
-
-
-def plot_dream(
-    real: np.ndarray,
-    dream: np.ndarray,
-    moment: int,
-    name: str,
-    steps: np.ndarray,
-    errors: dict[str, np.ndarray],
-) -> Figure:
-    """A moment of an episode beside its dream, and how far dreams are from reality by then.
-
-    Args:
-        real, dream: uint8 (T, 64, 64, 3) from the same moment on.
-        moment: the frame to show, from 0.
-        name: of the dream.
-        steps: of `errors`, 1 for the first dreamed frame.
-        errors: name -> error at these steps, 1 for that of the best constant picture.
-    """
-    figure, axes = new_figure(9.4, 3.0, 1, 3, width_ratios=[1, 1, 1.7])
-    for axis, picture, title in zip(axes[0], (real, dream), ("real", name), strict=False):
-        show_picture(axis, picture[moment])
-        caption(axis, title)
-    axis = axes[0, 2]
-    for (way, values), (color, dash) in zip(errors.items(), STYLES, strict=False):
-        axis.plot(steps, values, dash, color=color, label=way)
-    axis.axhline(1, **THIN)
-    axis.axvline(moment + 1, color="black", lw=1.5)
-    axis.set(xlabel="steps dreamed", ylabel="error (best constant = 1)", ylim=(0, None))
-    axis.legend(**SMALL, loc="lower right")
-    title = f"Step {moment + 1} of a dream ({(moment + 1) / 50:.1f} seconds)"
-    now = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
-    return describe(figure, title, "Real frame, dreamed frame, and errors at this step: ", now)

@@ -7,7 +7,6 @@ import pytest
 
 from stad_lab.agent import load_agent
 from stad_lab.config import Config
-from stad_lab.evaluation.parity import AREAS, compare_pictures
 from stad_lab.io.files import load_json
 from stad_lab.io.workers import worker_threads
 from stad_lab.training.dataset import Dataset, collect
@@ -25,6 +24,7 @@ from stad_study.benchmark import (
     v_speed,
 )
 from stad_study.cli import main
+from stad_study.parity import AREAS, compare_pictures
 
 
 def test_contenders_take_turns_in_alternating_order():

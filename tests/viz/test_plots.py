@@ -4,18 +4,14 @@ import itertools
 
 import numpy as np
 
-from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.viz.plots import (
     STYLES,
     difference_colors,
-    plot_bars,
     plot_curves,
     plot_histograms,
     plot_history,
     plot_intervals,
-    plot_mixture,
     plot_pictures,
-    plot_road,
     plot_scatter,
     plot_stacks,
 )
@@ -43,7 +39,6 @@ def test_the_alternative_text_of_a_figure_holds_its_values():
         plot_curves(curves, "T", "x", "y").get_label()
         == "T. Lines: one from 3 to 1.5, two from 0 to 0."
     )
-    assert "one from 9 to 1.5" in plot_bars(curves, "T", "x", "y").get_label()
     assert (
         "one 0.5 to 1.5" in plot_histograms({"one": np.array([0.25, 0.75])}, "T", "x").get_label()
     )
@@ -56,43 +51,10 @@ def test_neighbouring_lines_differ_in_colour_and_in_dashes():
     )
 
 
-def test_the_density_of_a_mixture_integrates_to_one_and_widens_with_the_temperature():
-    figure = plot_mixture(np.log([0.7, 0.3]), np.array([-1.0, 2.0]), np.log([0.5, 1.0]), [1.0, 4.0])
-    widths = []
-    for line in figure.axes[0].lines:
-        z, density = line.get_data()
-        assert abs(np.trapezoid(density, z) - 1) < 0.01
-        middle = np.trapezoid(z * density, z)
-        widths.append(np.trapezoid((z - middle) ** 2 * density, z))
-    weights = (
-        np.array([0.7, 0.3]) ** 0.25 / (np.array([0.7, 0.3]) ** 0.25).sum()
-    )  # as Mixture.sample has it
-    spread = weights @ np.array([-1.0, 2.0]) ** 2 - (weights @ np.array([-1.0, 2.0])) ** 2
-    assert np.allclose(
-        widths, [0.7 * 0.25 + 0.3 + 9 * 0.21, weights @ [1.0, 4.0] + spread], rtol=0.02
-    )
-
-
 def test_every_part_of_a_stack_is_drawn():
     stacks = {"one": dict.fromkeys("abcd", 1.0), "two": dict.fromkeys("abcd", 2.0)}
     bars = plot_stacks(stacks, "T", "x").axes[0].patches
     assert [bar.get_x() + bar.get_width() for bar in bars] == [1, 2, 3, 4, 2, 4, 6, 8]
-
-
-def test_a_road_has_its_true_width_and_is_enlarged_around_its_tile():
-    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
-    road = 100 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    figure = plot_road(
-        road, {"one": road[:50] * 1.01, "two": road[:80]}, "A ring", center=50, reach=30
-    )
-    ring, whole = figure.axes[0].patches[0].get_xy(), figure.axes[0].lines
-    radii = np.linalg.norm(ring, axis=1)
-    assert np.isclose(radii.min(), 100 - TRACK_WIDTH) and np.isclose(radii.max(), 100 + TRACK_WIDTH)
-    assert np.allclose(whole[0].get_xydata(), road[:50] * 1.01)
-    assert np.allclose(
-        [figure.axes[1].get_xlim(), figure.axes[1].get_ylim()], [[-30, 30], [70, 130]]
-    )
-    assert "200 tiles" in figure.get_label() and "one, two" in figure.get_label()
 
 
 def test_a_history_is_drawn_as_two_losses_over_the_steps():

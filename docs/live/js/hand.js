@@ -21,7 +21,7 @@ stad.Hand = class {
     this.gamepad = null;
   }
 
-  /** The next action, one small change from the last one. As stad_lab/play/session.py. */
+  /** The next action, one small change from the last one. As stad_course/play/session.py. */
   act() {
     const [full, press, release] = [
       [1, 0.7, 0.8],

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from stad_course.play.session import pose_of
 from stad_lab.agent import Agent, rollout
 from stad_lab.envs.cars import Cars
 from stad_lab.evaluation.trajectories import FRAMES_A_SECOND
-from stad_lab.play.session import pose_of
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from stad_lab import check_environment, doctor
+import stad_lab
+from stad_course import doctor
+from stad_course.doctor import check_environment
 from stad_lab.agent import PRETRAINED
 from stad_lab.training.trainer import training_device
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def check_in_a_process(*options, **variables):
-    """`python -m stad_lab check` in a process of its own."""
-    command = [sys.executable, *options, "-m", "stad_lab", "check"]
+    """`python -m stad_course doctor` in a process of its own."""
+    command = [sys.executable, *options, "-m", "stad_course", "doctor"]
     return subprocess.run(
         command,
         cwd=ROOT,
@@ -246,7 +248,7 @@ def test_every_weight_that_comes_along_is_looked_at(tmp_path, monkeypatch):
     cut = tmp_path / "pretrained" / "cropped_frame" / "mdn_rnn.safetensors"
     cut.parent.mkdir(parents=True)
     cut.write_bytes(b"version https://git-lfs.github.com/spec/v1")
-    monkeypatch.setattr(doctor, "__file__", str(tmp_path / "doctor.py"))
+    monkeypatch.setattr(stad_lab, "__file__", str(tmp_path / "__init__.py"))
     line = next(doctor.check_weights())
     assert line.state == "red" and "cropped_frame/mdn_rnn" in line.found
 

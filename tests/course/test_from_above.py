@@ -3,16 +3,17 @@
 import numpy as np
 import pytest
 
+from stad_course import from_above
+from stad_course.from_above import plot_learning, plot_maps, plot_road
 from stad_lab.agent import drive, load_agent
-from stad_lab.evaluation.paths import drive_from_above
+from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.training.evolution import make_agent
-from stad_lab.viz.plots import plot_learning, plot_maps
 
 
 def test_paths_begin_on_the_road_and_scores_are_those_of_a_drive():
     agent = load_agent("cropped_input")
     controllers = np.stack([agent.parameters, np.zeros_like(agent.parameters)])
-    found = drive_from_above(agent.world_model, controllers, [7, 7], max_frames=60)
+    found = from_above.drive(agent.world_model, controllers, [7, 7], max_frames=60)
     again = drive(make_agent(agent.world_model, controllers), [7, 7], max_frames=60)
     assert np.array_equal(found.returns, again.returns)
     assert [len(path) for path in found.paths] == again.lengths.tolist()
@@ -26,4 +27,20 @@ def test_paths_begin_on_the_road_and_scores_are_those_of_a_drive():
 def test_each_controller_needs_its_track():
     agent = load_agent("cropped_input")
     with pytest.raises(ValueError, match="1 controllers on 2 tracks"):
-        drive_from_above(agent.world_model, agent.parameters[None], [7, 8])
+        from_above.drive(agent.world_model, agent.parameters[None], [7, 8])
+
+
+def test_a_road_has_its_true_width_and_is_enlarged_around_its_tile():
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    road = 100 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    figure = plot_road(
+        road, {"one": road[:50] * 1.01, "two": road[:80]}, "A ring", center=50, reach=30
+    )
+    ring, whole = figure.axes[0].patches[0].get_xy(), figure.axes[0].lines
+    radii = np.linalg.norm(ring, axis=1)
+    assert np.isclose(radii.min(), 100 - TRACK_WIDTH) and np.isclose(radii.max(), 100 + TRACK_WIDTH)
+    assert np.allclose(whole[0].get_xydata(), road[:50] * 1.01)
+    assert np.allclose(
+        [figure.axes[1].get_xlim(), figure.axes[1].get_ylim()], [[-30, 30], [70, 130]]
+    )
+    assert "200 tiles" in figure.get_label() and "one, two" in figure.get_label()

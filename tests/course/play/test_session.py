@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
+from stad_course.play.session import Hand, Session
 from stad_lab import load_agent
 from stad_lab.evaluation.trajectories import driven_path, record_trajectory
 from stad_lab.features import remember_episode
 from stad_lab.models.mdn_rnn import to_state
-from stad_lab.play.session import Hand, Session
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import ipywidgets
 
+from stad_course.play.dashboard import SIZE, STRIP, draw_background, draw_moment, end_lines
+from stad_course.play.race import Ghost, drive_ghost
+from stad_course.play.session import LAST_TRACK, Session
 from stad_lab.evaluation.trajectories import FRAMES_A_SECOND
-from stad_lab.play.dashboard import SIZE, STRIP, draw_background, draw_moment, end_lines
-from stad_lab.play.race import Ghost, drive_ghost
-from stad_lab.play.session import LAST_TRACK, Session
 from stad_lab.viz.plots import BLUE, ORANGE, PURPLE
 from stad_lab.viz.widgets import picture_png
 

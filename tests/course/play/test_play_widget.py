@@ -9,11 +9,11 @@ import time
 import numpy as np
 import pytest
 
+from stad_course.play.dashboard import SIZE, end_lines, to_screen
+from stad_course.play.race import drive_ghost
+from stad_course.play.session import Session, pose_of
+from stad_course.play.widget import Loop, Seat
 from stad_lab import load_agent
-from stad_lab.play.dashboard import SIZE, end_lines, to_screen
-from stad_lab.play.race import drive_ghost
-from stad_lab.play.session import Session, pose_of
-from stad_lab.play.widget import Loop, Seat
 
 
 @pytest.fixture

@@ -199,7 +199,9 @@ def check_preset() -> Iterator[Line]:
 
 def check_weights() -> Iterator[Line]:
     """The trained weights that come with stad_lab."""
-    files = sorted(Path(__file__).with_name("pretrained").rglob("*.safetensors"))
+    import stad_lab
+
+    files = sorted(Path(stad_lab.__file__).with_name("pretrained").rglob("*.safetensors"))
     # A pointer of Git LFS, or an incomplete download:
     small = [f"{file.parent.name}/{file.name}" for file in files if file.stat().st_size < 500]
     size = sum(file.stat().st_size for file in files) / 1e6

@@ -9,12 +9,12 @@ from html import escape
 
 import numpy as np
 
+from stad_course.play.race import Ghost
+from stad_course.play.session import Session, pose_of
 from stad_lab.envs import physics, picture
 from stad_lab.envs.frames import OBSERVATION_SIZE
 from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.trajectories import FRAMES_A_SECOND
-from stad_lab.play.race import Ghost
-from stad_lab.play.session import Session, pose_of
 from stad_lab.viz.plots import BLUE, ORANGE, PURPLE
 
 SIZE, STRIP = 480, 60  # of the whole, and the height of the dashboard at its bottom

@@ -1,0 +1,200 @@
+"""Figures of the lessons, each for one idea; the others are in `stad_lab.viz.plots`."""
+
+from collections.abc import Callable
+from itertools import cycle
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from stad_lab.evaluation.statistics import SOLVED
+from stad_lab.viz.plots import (
+    BLUE,
+    COLORS,
+    MARKERS,
+    ORANGE,
+    RED,
+    SKY,
+    SMALL,
+    STYLES,
+    THIN,
+    caption,
+    describe,
+    legend_below,
+    new_figure,
+    show_picture,
+)
+
+
+def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
+    """The car's speed at the end of every episode, and for each stride the mean `|d|` there."""
+    figure, ((axis,),) = new_figure(6.5, 3.6)
+    for (stride, values), color in zip(change.items(), cycle(COLORS), strict=False):
+        label = f"stride {stride}: correlation {np.corrcoef(speed, values)[0, 1]:.2f}"
+        axis.scatter(speed, values, s=8, color=color, alpha=0.6, label=label)
+    axis.set(xlabel="true speed (world units per second)", ylabel="mean |d| of the frame")
+    axis.legend(frameon=False)
+    title = "The difference image grows with speed, and with the stride"
+    lead = "One point for every episode and stride; strides "
+    return describe(figure, title, lead, map(str, change))
+
+
+def plot_rate_distortion(
+    rates: np.ndarray, errors: np.ndarray, names: list[str], title: str
+) -> Figure:
+    """Rate (KL, nats) against distortion (squared error), a named point for each V."""
+    figure, ((axis,),) = new_figure(6.5, 3.4)
+    axis.plot(rates, errors, "o-", color=BLUE)
+    axis.set(xlabel="rate: KL (nats)", ylabel="distortion: squared error")
+    axis.margins(0.18)
+    values = []
+    for name, rate, error in zip(names, rates, errors, strict=True):
+        place = {"xytext": (6, 6), "textcoords": "offset points"}
+        axis.annotate(name, (rate, error), fontsize=9, **place)
+        values.append(f"{name} {rate:.0f} nats, {error:.0f}")
+    return describe(figure, title, "Points: ", values)
+
+
+def plot_mixture(
+    logpi: np.ndarray,
+    mean: np.ndarray,
+    logsigma: np.ndarray,
+    temperatures: list[float],
+    actual: float | None = None,
+) -> Figure:
+    """The density of a mixture, each array (mixtures,), at some temperatures."""
+    figure, ((axis,),) = new_figure(6.5, 3.4)
+    reach = 4 * np.exp(logsigma) * np.sqrt(max(temperatures))
+    z = np.linspace((mean - reach).min(), (mean + reach).max(), 600)
+    for temperature, (color, dash) in zip(temperatures, cycle(STYLES), strict=False):
+        weights = np.exp((logpi - logpi.max()) / temperature)
+        weights /= weights.sum()
+        sigma = np.exp(logsigma) * np.sqrt(temperature)
+        gaussians = np.exp(-0.5 * ((z[:, None] - mean) / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
+        label = f"temperature {temperature:g}"
+        axis.plot(z, gaussians @ weights, dash, color=color, lw=2, label=label)
+        if len(temperatures) == 1:
+            axis.plot(z, weights * gaussians, **THIN)
+    if actual is not None:
+        axis.axvline(actual, color=RED, ls="--", lw=1.5, label="actual value")
+    axis.set(xlabel="next value of the latent", ylabel="probability density", ylim=(0, None))
+    axis.legend(frameon=False)
+    lead, chosen = "Density of the mixture at temperature ", (f"{one:g}" for one in temperatures)
+    return describe(figure, "M's prediction for one latent", lead, chosen)
+
+
+def plot_dream(
+    real: np.ndarray,
+    dream: np.ndarray,
+    moment: int,
+    name: str,
+    steps: np.ndarray,
+    errors: dict[str, np.ndarray],
+) -> Figure:
+    """A moment of an episode beside its dream, and how far dreams are from reality by then.
+
+    Args:
+        real, dream: uint8 (T, 64, 64, 3) from the same moment on.
+        moment: the frame to show, from 0.
+        name: of the dream.
+        steps: of `errors`, 1 for the first dreamed frame.
+        errors: name -> error at these steps, 1 for that of the best constant picture.
+    """
+    figure, axes = new_figure(9.4, 3.0, 1, 3, width_ratios=[1, 1, 1.7])
+    for axis, picture, title in zip(axes[0], (real, dream), ("real", name), strict=False):
+        show_picture(axis, picture[moment])
+        caption(axis, title)
+    axis = axes[0, 2]
+    for (way, values), (color, dash) in zip(errors.items(), STYLES, strict=False):
+        axis.plot(steps, values, dash, color=color, label=way)
+    axis.axhline(1, **THIN)
+    axis.axvline(moment + 1, color="black", lw=1.5)
+    axis.set(xlabel="steps dreamed", ylabel="error (best constant = 1)", ylim=(0, None))
+    axis.legend(**SMALL, loc="lower right")
+    title = f"Step {moment + 1} of a dream ({(moment + 1) / 50:.1f} seconds)"
+    now = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
+    return describe(figure, title, "Real frame, dreamed frame, and errors at this step: ", now)
+
+
+def plot_cma_es(
+    landscape: Callable[[np.ndarray], np.ndarray],
+    generations: list[dict],
+    shown: list[int],
+    title: str = "Population (dots), mean (cross) and one-sigma ellipse of CMA-ES",
+) -> Figure:
+    """CMA-ES on a function of two variables: population and one-sigma ellipse of generations.
+
+    Args:
+        landscape: function of an array (..., 2), to be minimised.
+        generations: each {"population" (n, 2), "mean" (2,), "covariance" (2, 2)}, the covariance
+            with sigma squared.
+        shown: indices of the generations to draw, one panel each.
+    """
+    size, reach = (2.5 * len(shown) + 0.5, 3.5), 4.0  # the panels show [-4, 4] in both variables
+    figure, axes = new_figure(*size, 1, len(shown), sharex=True, sharey=True)
+    x = np.linspace(-reach, reach, 121)
+    height = landscape(np.stack(np.meshgrid(x, x), axis=-1))
+    dots = {"s": 16, "color": ORANGE, "edgecolor": "black", "lw": 0.4, "zorder": 3}
+    outline = {"fill": False, "ec": SKY, "lw": 2.5, "zorder": 4}
+    for index, axis in zip(shown, axes[0], strict=True):
+        generation, mean = generations[index], generations[index]["mean"]
+        axis.contourf(x, x, np.log(height - height.min() + 1e-2), 18, cmap="Greys_r", alpha=0.8)
+        axis.scatter(*generation["population"].T, **dots)
+        values, vectors = np.linalg.eigh(generation["covariance"])
+        tilt = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+        thickness, width = 2 * np.sqrt(values)
+        axis.add_patch(Ellipse(mean, width, thickness, angle=tilt, **outline))
+        axis.plot(*mean, "+", color=RED, ms=10, mew=2, zorder=5)
+        axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
+        caption(axis, f"generation {index + 1}", "x")
+    axes[0, 0].set_ylabel("y")
+    describe(figure, title, "Generations ", (str(index + 1) for index in shown))
+    if len(shown) < 3:
+        figure.suptitle("Population, mean, ellipse", fontsize=11)  # for a narrow figure
+    return figure
+
+
+def plot_ranks(ranks: dict[str, np.ndarray], title: str) -> Figure:
+    """Ranks of the same candidates in several contests: name -> ranks (candidates,), 1 the best.
+
+    A line for each candidate; the winner of the first contest is ORANGE.
+    """
+    figure, ((axis,),) = new_figure(6.5, 3.6)
+    table = np.array(list(ranks.values()))
+    winner = int(table[0].argmin())
+    for candidate in range(table.shape[1]):
+        if candidate != winner:
+            axis.plot(table[:, candidate], "o-", color=BLUE, alpha=0.35, ms=4)
+    label = "who won on the first"
+    axis.plot(table[:, winner], "o-", color=ORANGE, lw=2.5, ms=7, label=label)
+    axis.set(xticks=range(len(ranks)), xticklabels=list(ranks), ylabel="rank (1: the best)")
+    axis.set_ylim(table.max() + 1, 0)
+    legend_below(figure, axis)
+    places = [f"{name} rank {own[winner]}" for name, own in ranks.items()]
+    return describe(figure, title, "The winner of the first: ", places)
+
+
+def plot_episodes(
+    runs: dict[str, list[tuple[np.ndarray, np.ndarray]]],
+    published: dict[str, dict[int, float]],
+    title: str,
+) -> Figure:
+    """Sample efficiency: score against the episodes driven for it, on a logarithmic axis.
+
+    Args:
+        runs: name -> for every seed its episodes and its scores at those.
+        published: name -> episodes -> score, as others have reported: points without a line.
+    """
+    figure, ((axis,),) = new_figure(8.0, 4.2 + 0.08 * len(runs))
+    last = []
+    for (name, seeds), (color, dash) in zip(runs.items(), cycle(STYLES), strict=False):
+        for episodes, scores in seeds:
+            (line,) = axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8)
+        line.set_label(name)
+        last.append(f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}")
+    for (name, points), marker in zip(published.items(), MARKERS, strict=False):
+        axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
+    axis.axhline(SOLVED, **THIN)
+    axis.set(xscale="log", xlabel="episodes (logarithmic)", ylabel="score", ylim=(None, 960))
+    legend_below(figure, axis)  # inside the axis, many names would hide the points
+    return describe(figure, title, "At the end, mean of the seeds: ", last)
