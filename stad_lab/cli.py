@@ -218,18 +218,6 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
     print(f"  with intervals: {file}")
 
 
-def ship(run: str, name: str) -> None:
-    """Copy a run's weights and records to stad_lab/pretrained/NAME.
-
-    Args:
-        run: Folder of the run.
-        name: Of the shipped agent.
-    """
-    from stad_lab.training.pipeline import ship
-
-    print(f"shipped to {ship(run, name)}")
-
-
 def report(run: str, out: Path | None = None) -> None:
     """Write a page about a run, finished or not: scores, film, curves, and what made it.
 
@@ -280,7 +268,6 @@ COMMANDS: dict[str, Callable] = {
     "evaluate": evaluate,
     "verify": verify,
     "probe": probe,
-    "ship": ship,
     "report": report,
     "film": film,
 }

@@ -183,6 +183,18 @@ def benchmark(
         add_speed(json)
 
 
+def ship(run: str, name: str) -> None:
+    """Copy a run's weights and records to stad_lab/pretrained/NAME.
+
+    Args:
+        run: Folder of the run.
+        name: Of the shipped agent.
+    """
+    from stad_study.ship import ship
+
+    print(f"shipped to {ship(run, name)}")
+
+
 COMMANDS: dict[str, Callable] = {
     "replicate": replicate,
     "evaluate": evaluate,
@@ -190,6 +202,7 @@ COMMANDS: dict[str, Callable] = {
     "claims": claims,
     "latents": latents,
     "benchmark": benchmark,
+    "ship": ship,
 }
 CONTINUES = ("replicate", "probe", "latents")
 PROGRAM = command_line.Program(

@@ -44,7 +44,7 @@ from stad_study.study import CARS, STUDIES
 
 WORLD_FILE = "world.safetensors"
 PLACEBO_EPISODES = 64  # of an agent, on tracks kept for inspection
-VARIANTS = ("frame", "input", "input_output")
+SENSED_VARIANTS = ("frame", "input", "input_output")
 
 
 def prepare_seed(seed: int, folder: Path, networks: Path) -> None:
@@ -55,7 +55,7 @@ def prepare_seed(seed: int, folder: Path, networks: Path) -> None:
 
     Raises FileNotFoundError or ValueError as `load_kept_world_model`.
     """
-    kept = {one: networks / f"seed{seed}" / one / WORLD_MODEL_FILE for one in VARIANTS}
+    kept = {one: networks / f"seed{seed}" / one / WORLD_MODEL_FILE for one in SENSED_VARIANTS}
     models = {one: load_kept_world_model(file) for one, file in kept.items() if file.exists()}
     config = STUDIES["study1"].config.replace(seed=seed)
     count = range(config.data.episodes)

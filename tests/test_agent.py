@@ -22,7 +22,8 @@ from stad_lab.models.controller import initial_parameters, parameter_count
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training.dataset import Dataset
-from stad_lab.training.pipeline import ship, train
+from stad_lab.training.pipeline import train
+from stad_study.ship import ship
 
 TRUNCATED_AFTER = 10  # bytes that a damaged file lacks
 
@@ -377,7 +378,7 @@ def test_a_folder_that_is_made_again_is_read_again(tmp_path):
 @pytest.fixture
 def pretrained(tmp_path, monkeypatch):
     """An empty folder for shipped agents."""
-    for module in ("stad_lab.agent", "stad_lab.training.pipeline"):
+    for module in ("stad_lab.agent", "stad_study.ship"):
         monkeypatch.setattr(f"{module}.PRETRAINED", tmp_path / "shipped")
     return tmp_path / "shipped"
 

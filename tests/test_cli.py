@@ -174,14 +174,6 @@ def test_a_record_without_a_field_that_was_added_later_is_continued(run):
     assert call(*train_quickly(run)) == 0
 
 
-def test_a_run_of_the_first_edition_is_refused_in_one_line(run, capsys):
-    save_json(run / "record.json", {"variant": "input_output", "settings": {"name": "quick"}})
-    before = states(run)
-    error = the_error(capsys, *train_quickly(run))
-    assert f"{run} holds a run of stad_lab 0.1: continue it with that version" in error
-    assert states(run) == before
-
-
 def test_the_command_in_a_record_asks_for_the_configuration_of_that_record(monkeypatch):
     changes = {"data": {"crop_bar": False}, "vae": {"stride": 2}, "evolution": {"features": "z"}}
     config = Config.preset("laptop", variant="input", **changes)
@@ -520,5 +512,5 @@ def test_a_folder_whose_letters_the_console_lacks_is_no_error(quick_run, tmp_pat
 
 
 def test_parsing_a_command_does_not_run_it(monkeypatch):
-    monkeypatch.setitem(cli.COMMANDS, "ship", lambda: pytest.fail("it ran"))
-    assert callable(parse(["ship"]))
+    monkeypatch.setitem(cli.COMMANDS, "verify", lambda: pytest.fail("it ran"))
+    assert callable(parse(["verify"]))

@@ -34,12 +34,9 @@ HEARTBEAT = 30.0  # seconds, after which the record says how long a stage has ta
 
 
 def check_record(folder: Path) -> None:
-    """Raise ValueError if a folder holds a run of stad_lab 0.1, or a record of no run."""
+    """Raise ValueError if a folder holds a record of no run."""
     path = folder / RECORD
     record = load_json(path) if path.exists() else {"config": {}}
-    if "settings" in record:
-        remedy = "continue it with that version, or choose another folder"
-        raise ValueError(f"{folder} holds a run of stad_lab 0.1: {remedy}")
     if "config" not in record:
         raise ValueError(f"{path} is of {record.get('variant')!r}, no run: choose another folder")
 

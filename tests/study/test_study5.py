@@ -43,7 +43,7 @@ def networks(tmp_path_factory):
     """A folder of kept worlds of one tiny seed, whose V and M are untrained."""
     folder = tmp_path_factory.mktemp("networks")
     v, m = CONFIG.vae, CONFIG.mdn_rnn
-    for variant in world_facts.VARIANTS:
+    for variant in world_facts.SENSED_VARIANTS:
         run, config = folder / variant, CONFIG.replace(variant=variant)
         with torch_settings(0, 0):
             save_vae(run / VAE_FILE, VAE(variant, v.latent_size, v.width), config)

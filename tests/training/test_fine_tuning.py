@@ -13,12 +13,11 @@ from stad_lab.cli import main
 from stad_lab.evaluation.verify import verify
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.weights import load_controller, load_world_model, save_controller
-from stad_lab.training import pipeline
 from stad_lab.training.evolution import LOG, generation_tracks
 from stad_lab.training.fine_tuning import FINE_TUNING, begin, fine_tune, fine_tuning_config
-from stad_lab.training.pipeline import ship
 from stad_lab.training.record import total_budget
 from stad_lab.training.subspace import load_start, search_space
+from stad_study.ship import ship
 
 BRIEF = {"generations": 2, "population": 4, "tracks": 2, "validate_every": 1}
 C = "controller.safetensors"
@@ -116,7 +115,7 @@ def test_an_interrupted_copy_of_v_is_made_again(tuned, quick_run, tmp_path, monk
 
 
 def test_a_fine_tuned_run_can_be_verified_shipped_and_verified_again(tuned, tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline, "PRETRAINED", tmp_path)
+    monkeypatch.setattr("stad_study.ship.PRETRAINED", tmp_path)
     shipped = ship(tuned, "tuned")
     assert shipped == tmp_path / "tuned"
     assert np.array_equal(load_agent(shipped).parameters, load_agent(tuned).parameters)

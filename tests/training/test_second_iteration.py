@@ -17,10 +17,10 @@ from stad_lab.evaluation.verify import verify
 from stad_lab.features import features_of
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.weights import load_controller, load_world_model, save_controller
-from stad_lab.training import pipeline, second_iteration
+from stad_lab.training import second_iteration
 from stad_lab.training.dataset import Dataset, collect, drive_randomly
 from stad_lab.training.evolution import LOG
-from stad_lab.training.pipeline import ship, train
+from stad_lab.training.pipeline import train
 from stad_lab.training.record import total_budget
 from stad_lab.training.second_iteration import (
     carry_over,
@@ -31,6 +31,7 @@ from stad_lab.training.second_iteration import (
     outputs,
 )
 from stad_lab.training.subspace import START_FILE, load_start
+from stad_study.ship import ship
 
 QUICK = Config.preset("quick")
 BRIEF = {"vae": {"steps": 8}, "mdn_rnn": {"steps": 4}}
@@ -331,7 +332,7 @@ def test_a_finished_second_iteration_is_verified_shipped_and_left_alone(
     second, quick_run, tmp_path, monkeypatch
 ):
     assert not train(CONFIG, second, earlier=quick_run)
-    monkeypatch.setattr(pipeline, "PRETRAINED", tmp_path)
+    monkeypatch.setattr("stad_study.ship.PRETRAINED", tmp_path)
     shipped = ship(second, "second")
     assert load_agent(shipped).parameters.size == 3 * 56 + 3
     for folder in (second, shipped):

@@ -15,10 +15,9 @@ from stad_lab.io.weights import WorldModel, load_controller, load_world_model
 from stad_lab.models.controller import control, seen_columns
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
-from stad_lab.training import pipeline
 from stad_lab.training.dataset import Dataset, collect
 from stad_lab.training.evolution import LOG, averaged_mean, evolve, replay
-from stad_lab.training.pipeline import ship, train
+from stad_lab.training.pipeline import train
 from stad_lab.training.subspace import (
     COMPONENTS_FILE,
     START_FILE,
@@ -27,6 +26,7 @@ from stad_lab.training.subspace import (
     save_start,
     search_space,
 )
+from stad_study.ship import ship
 
 QUICK = Config.preset("quick")
 CONFIG = QUICK.replace(evolution={"components": 5, "sigma_decay": 0.9}, processes=1)
@@ -159,7 +159,7 @@ def test_a_run_does_not_continue_along_other_components(searched, tmp_path):
 def test_a_run_along_components_can_be_verified_shipped_and_verified_again(
     searched, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(pipeline, "PRETRAINED", tmp_path)
+    monkeypatch.setattr("stad_study.ship.PRETRAINED", tmp_path)
     for folder in (searched, ship(searched, "searched")):
         found = verify(folder)
         assert found["log of CMA-ES"] == "ok: 4 generations give the same mean", found
