@@ -7,7 +7,7 @@ import tyro
 
 from stad_course.compete.limits import Limits
 from stad_lab import command_line
-from stad_lab.command_line import output
+from stad_lab.command_line import given, output
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -22,7 +22,7 @@ def doctor() -> int:
     return tell_environment()
 
 
-def kit(file: tyro.conf.Positional[Path]) -> None:
+def kit(file: tyro.conf.Positional[str]) -> None:
     """Write a first agent to a file, to begin from.
 
     Args:
@@ -30,39 +30,39 @@ def kit(file: tyro.conf.Positional[Path]) -> None:
     """
     from stad_course.compete import run
 
-    print(run.write_kit(file))
+    print(run.write_kit(given(file, "the name of the file")))
 
 
-def check(submission: tyro.conf.Positional[Path], limits: Limits = Limits()) -> int:  # noqa: B008
+def check(submission: tyro.conf.Positional[str], limits: Limits = Limits()) -> int:  # noqa: B008
     """Try one submission on three public tracks, as its author would.
 
     Args:
-        submission: A Python file with make_agent(), or the folder of a run.
+        submission: A Python file with make_agent(), a folder with such an agent.py, or a run.
         limits: What a submission may use.
     """
     from stad_course.compete import run
 
-    said = run.check_submission(submission, limits)
+    said = run.check_submission(given(submission, "the submission"), limits)
     print(said)
     return int(said.startswith("FAILED"))
 
 
-def commit(secret: tyro.conf.Positional[Path], tracks: int = 50) -> None:
+def commit(secret: tyro.conf.Positional[str], tracks: int | None = None) -> None:
     """Draw hidden tracks, keep them in a file, and print the hash to publish.
 
     Of a file that exists only the hash is printed.
 
     Args:
-        secret: The file of hidden tracks.
-        tracks: How many to draw.
+        secret: The file of hidden tracks, ending in .json.
+        tracks: How many to draw; 50 if not given.
     """
     from stad_course.compete import run
 
-    print(run.hide_tracks(secret, tracks))
+    print(run.hide_tracks(given(secret, "the file of hidden tracks"), tracks))
 
 
 def compete(
-    submissions: tyro.conf.Positional[Path],
+    submissions: tyro.conf.Positional[str],
     secret: Path,
     out: str = "competition",
     reveal: bool = False,
@@ -85,7 +85,8 @@ def compete(
     """
     from stad_course.compete import run
 
-    page = run.run(submissions, secret, output(out), limits, processes, reveal, baselines)
+    folder = given(submissions, "the folder of submissions")
+    page = run.run(folder, secret, output(out), limits, processes, reveal, baselines)
     print(f"written to {page}")
 
 

@@ -23,7 +23,7 @@ MODULES = (
     *("numpy", "scipy", "pandas", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma"),
     *("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl"),
 )
-NEEDED = ("", "train")  # extras without which the notebooks do not run
+NEEDED = ("", "train")  # extras without which no agent can be trained or driven
 OPTIONAL_MODULES = ("matplotlib", "PIL", "ipywidgets", "distributed")  # of the extras
 
 

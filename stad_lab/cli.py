@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 
 from stad_lab import command_line
-from stad_lab.command_line import cluster_of, output
+from stad_lab.command_line import cluster_of, given, output
 from stad_lab.config import PRESETS, REPORTED_TRACKS, Config
 
 
@@ -90,6 +90,9 @@ def training_command(config: Config) -> Callable:
         from stad_lab.training.pipeline import train
 
         folder, board = output(out), None
+        for option, path in (("--dataset", dataset), ("--earlier", earlier)):
+            if path is not None:
+                given(path, option)
         if tensorboard:
             from stad_lab.viz.tensorboard import TensorBoard
 
@@ -151,7 +154,7 @@ def evaluate(
     Stop it when you like; the same command continues.
 
     Args:
-        agent: A shipped agent (frame, input, output, input_output), or the folder of a run.
+        agent: A shipped agent, or the folder of a run.
         episodes: Number of tracks.
         first_track: Seed of the first track.
         fast: Render with the fast renderer instead of Gymnasium's own (not for reports).
@@ -227,9 +230,11 @@ def report(run: str, out: Path | None = None) -> None:
     """
     from stad_lab.agent import PRETRAINED, run_folder
     from stad_lab.io.files import check_writable, write_bytes
+    from stad_lab.training.record import check_record
     from stad_lab.viz.report import report
 
     folder = run_folder(run)
+    check_record(folder)
     shipped = folder.parent == PRETRAINED
     file = out or (Path(f"report-{folder.name}.html") if shipped else folder / "report.html")
     if file.suffix.lower() != ".html":

@@ -81,7 +81,8 @@ def parse(
     except SystemExit as ended:
         if not ended.code:
             raise
-        raise ValueError(f"{one_line(told.getvalue())}; see {program.name} --help") from None
+        again = f"{program.name} {command}" if command in commands else program.name
+        raise ValueError(f"{one_line(told.getvalue())}; see {again} --help") from None
 
 
 def deferred(command: Callable) -> Callable:
@@ -127,8 +128,13 @@ def cluster_of(scheduler: str | None) -> contextlib.AbstractContextManager[Execu
     return cluster(scheduler)
 
 
-def output(path: str) -> Path:
-    """A folder or file to write to. ValueError if it is empty, which would mean this folder."""
+def given(path: str, option: str) -> Path:
+    """A folder or file that was asked for. ValueError if it is empty: that would be this folder."""
     if not path.strip():
-        raise ValueError("--out is empty: give the name of a folder or file, such as runs/input")
+        raise ValueError(f"{option} is empty: give the name of a folder or file")
     return Path(path)
+
+
+def output(path: str) -> Path:
+    """A folder or file to write to. ValueError if it is empty."""
+    return given(path, "--out")

@@ -85,4 +85,4 @@ def how_to_get(study: str) -> str:
     """What to do about kept agents that are not there, for a message."""
     if not NETWORKS.is_dir():
         return "clone the repository of stad_lab, what pip installs does not hold them"
-    return f"make them with `python -m stad_study replicate {study}`"
+    return f"make them with `python -m stad_study replicate {study} --out runs/replication`"

@@ -22,7 +22,8 @@ def ship(folder: str | Path, name: str) -> Path:
     folder, target = Path(folder), PRETRAINED / name
     load_vae(folder / VAE_FILE)
     if target.resolve() == folder.resolve() or not name.isidentifier():
-        raise ValueError(f"name={name!r}, folder={folder}: expected a new name and another folder")
+        expected = "a new name of letters, digits and _, and another folder"
+        raise ValueError(f"name={name!r}, folder={folder}: expected {expected}")
     shipped = [one for one in (*WEIGHTS, RECORD, LOG) if (folder / one).exists()]
     read = {one: load_tensors(folder / one) for one in shipped if one in WEIGHTS}  # all, then write
     for one, (tensors, metadata) in read.items():

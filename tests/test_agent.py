@@ -405,8 +405,8 @@ def test_a_damaged_run_is_not_shipped_and_one_without_c_leaves_none_of_before(
     (run / "controller.safetensors").write_bytes(b"cut short")
     for folder, name, message in (
         (run, "mine", r"controller\.safetensors is damaged"),
-        (target, "mine", "expected a new name and another folder"),
-        (quick_run, "../mine", "expected a new name and another folder"),
+        (target, "mine", "expected a new name of letters"),
+        (quick_run, "../mine", "expected a new name of letters"),
     ):
         with pytest.raises(ValueError, match=message):
             ship(folder, name)

@@ -511,6 +511,21 @@ def test_a_folder_whose_letters_the_console_lacks_is_no_error(quick_run, tmp_pat
     assert b"nothing to do" in printed and b"\\u0141" in printed
 
 
+@pytest.mark.parametrize("option", ["--dataset", "--earlier", "--out"])
+def test_an_empty_folder_is_not_the_present_one(option, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    error = the_error(capsys, *train_quickly(tmp_path / "run", option, ""))
+    assert f"{option} is empty" in error and not list(tmp_path.glob("*.npy"))
+
+
+@pytest.mark.parametrize("command", ["report --run", "verify", "train quick --out"])
+def test_a_file_in_the_place_of_a_run_is_named(command, tmp_path, capsys):
+    (tmp_path / "notes.md").write_text("mine")
+    error = the_error(capsys, *command.split(), str(tmp_path / "notes.md"))
+    assert "notes.md is a file: give the folder of a run" in error
+    assert (tmp_path / "notes.md").read_text() == "mine"
+
+
 def test_parsing_a_command_does_not_run_it(monkeypatch):
     monkeypatch.setitem(cli.COMMANDS, "verify", lambda: pytest.fail("it ran"))
     assert callable(parse(["verify"]))

@@ -80,6 +80,10 @@ def load_submission(path: Path) -> Separate | Together:
     file = path / AGENT_FILE if path.is_dir() else path
     if not file.exists():
         from stad_lab.agent import load_agent
+        from stad_lab.io.weights import VAE_FILE
+
+        if not (path / VAE_FILE).exists():
+            raise ValueError("the folder holds neither agent.py with make_agent(), nor a run")
 
         return Together(load_agent(path))
     sys.path.append(str(file.parent))

@@ -21,6 +21,7 @@ KIND = "competition"
 LOST = -100.0  # points; what leaving the field costs
 MOST_FAILURES = 3
 BATCH = 10  # tracks at once
+BASELINE = "baseline-"  # before the names of our own agents
 STARTER = Path(__file__).parent / "starter"
 BASELINES = {"random": STARTER / "random_agent.py", "gentle": STARTER / "gentle_agent.py"}
 BASELINES |= {name: PRETRAINED / name for name in ("frame", "input", "output", "input_output")}
@@ -29,7 +30,7 @@ BASELINES |= {name: PRETRAINED / name for name in ("frame", "input", "output", "
 def find_submissions(folder: Path) -> dict[str, Path]:
     """The submissions in a folder by name: Python files, and folders.
 
-    ValueError if there are none, or two of one name.
+    ValueError if there are none, two of one name, or one of a name that is kept for baselines.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder: expected one with submissions")
@@ -37,9 +38,12 @@ def find_submissions(folder: Path) -> dict[str, Path]:
     for path in sorted(folder.iterdir()):
         if path.name[0] in "._" or not (path.is_dir() or path.suffix == ".py"):
             continue
-        if path.stem in found:
-            raise ValueError(f"{folder} has two submissions {path.stem!r}: rename one")
-        found[path.stem] = path
+        name = path.name if path.is_dir() else path.stem
+        if name in found:
+            raise ValueError(f"{folder} has two submissions {name!r}: rename one")
+        if name.startswith(BASELINE):
+            raise ValueError(f"{path}: names with {BASELINE!r} are those of our agents: rename it")
+        found[name] = path
     if not found:
         raise ValueError(f"{folder} has no submissions: expected Python files or runs' folders")
     return found
@@ -65,6 +69,8 @@ def compete(
         (name, path, tracks, folder / f"{name}.json", limits, hidden)
         for name, path in entries.items()
     ]
+    for _, _, _, file, *_ in tasks:
+        check_conditions(file, tracks, limits)
     with worker_threads(processes) as executor:
         for number, result in run_tasks(executor, drive_submission, tasks, patience=86_400.0):
             mean, errors = np.mean(result["returns"]), result["failures"]
@@ -73,12 +79,29 @@ def compete(
     return [load_json(task[3], kind=KIND) | {"name": task[0]} for task in tasks]
 
 
+def conditions(tracks: list[int], limits: Limits) -> dict[str, Any]:
+    """What all results of a competition have in common."""
+    return {"tracks": checksum_of_json(tracks), "limits": asdict(limits)}
+
+
+def check_conditions(file: Path, tracks: list[int], limits: Limits) -> None:
+    """Raise ValueError if results that are there were driven on other tracks or with other limits.
+
+    A submission that was changed drives again; results under other conditions are not replaced.
+    """
+    if file.exists():
+        known = load_json(file, "delete it, to drive again", kind=KIND)
+        for name, asked in conditions(tracks, limits).items():
+            if known.get(name) != asked:
+                found = f"{file} was driven with other {name}"
+                raise ValueError(f"{found}: ask for the same, or choose another folder with --out")
+
+
 def drive_submission(
     name: str, path: Path, tracks: list[int], file: Path, limits: Limits, hidden: tuple[Path, ...]
 ) -> dict:
     """Drive all tracks with one submission, from where the file of its results ends."""
-    asked: dict[str, Any] = {"submission": fingerprint(path), "tracks": checksum_of_json(tracks)}
-    asked |= {"limits": asdict(limits)}
+    asked = {"submission": fingerprint(path)} | conditions(tracks, limits)
     result: dict[str, Any] = {
         "kind": KIND,
         **asked,
@@ -167,7 +190,13 @@ def fingerprint(path: Path) -> str:
 
 
 def check_submission(path: Path, limits: Limits, tracks: tuple[int, ...] = (0, 1, 2)) -> str:
-    """Drive a few public tracks with a submission; one line on how it went."""
+    """Drive a few public tracks with a submission; one line on how it went.
+
+    FileNotFoundError if there is none of this name.
+    """
+    if not path.exists():
+        expected = "a Python file with make_agent(), or the folder of a run"
+        raise FileNotFoundError(f"{path} does not exist: expected {expected}")
     result: dict[str, Any] = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
     drive_batch(path, list(tracks), result, limits, ())
     if result["failures"]:

@@ -1,6 +1,9 @@
 """What a submission may use."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass
+
+MOST = 1e6  # of any limit
 
 
 @dataclass(frozen=True)
@@ -18,3 +21,8 @@ class Limits:
     step: float = 0.2
     total: float = 300.0
     memory: float = 2.0
+
+    def __post_init__(self):
+        for name, value in asdict(self).items():
+            if not (math.isfinite(value) and 0 < value <= MOST):
+                raise ValueError(f"limits.{name}={value:g}: expected more than 0, up to {MOST:g}")

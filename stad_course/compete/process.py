@@ -249,7 +249,7 @@ def copied(path: Path, folder: Path) -> Path:
         raise Failure(
             f"it has {size / 1e6:.0f} MB, at most {LARGEST_SUBMISSION / 1e6:.0f} are read"
         )
-    target = folder / path.name
+    target = folder / path.resolve().name
     if path.is_file():
         return Path(shutil.copyfile(path, target))
     return Path(shutil.copytree(path, target, symlinks=True))

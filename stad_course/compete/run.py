@@ -1,9 +1,11 @@
 """The command `compete`: from a folder of submissions to a leaderboard."""
 
+import shlex
 import shutil
 from pathlib import Path
 
 from stad_course.compete.drive import (
+    BASELINE,
     BASELINES,
     STARTER,
     check_submission,
@@ -18,7 +20,6 @@ from stad_course.compete.tracks import hide_tracks, load_tracks
 from stad_lab.io.files import locked, write_bytes
 
 __all__ = ["check_submission", "hide_tracks", "run", "write_kit"]
-BASELINE = "baseline-"  # before the names of our own
 
 
 def run(
@@ -31,6 +32,8 @@ def run(
     baselines: bool = True,
 ) -> Path:
     """Drive all submissions and the baselines, and write the leaderboard; returns its path."""
+    if out.resolve().is_relative_to(submissions.resolve()):
+        raise ValueError(f"--out {out} lies in the folder of submissions: choose another")
     tracks, commitment = load_tracks(secret)
     ours = BASELINES if baselines else {}
     entries = {f"{BASELINE}{name}": path for name, path in ours.items()}
@@ -50,7 +53,10 @@ def run(
 
 def write_kit(file: Path) -> str:
     """Write a first agent to a file that does not exist yet; says how to try it."""
+    if file.suffix != ".py":
+        raise ValueError(f"{file}: expected a name that ends in .py")
     if file.exists():
         raise FileExistsError(f"{file} exists: choose another name")
+    file.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(STARTER / "my_agent.py", file)
-    return f"written to {file}; try it: python -m stad_course check {file}"
+    return f"written to {file}; try it: python -m stad_course check {shlex.quote(str(file))}"

@@ -50,6 +50,9 @@ def make_own_track(checkpoints: Checkpoints) -> Track:
 
 def read_checkpoints(path: Path) -> list:
     """The entry "checkpoints" of a JSON file. ValueError if it has none."""
+    if not path.is_file():
+        expected = "expected a JSON file of checkpoints"
+        raise FileNotFoundError(f"track={str(path)!r} is no file: {expected}")
     size = path.stat().st_size
     try:
         found = json.loads(path.read_bytes()[:LARGEST_FILE])["checkpoints"]

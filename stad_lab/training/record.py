@@ -34,7 +34,9 @@ HEARTBEAT = 30.0  # seconds, after which the record says how long a stage has ta
 
 
 def check_record(folder: Path) -> None:
-    """Raise ValueError if a folder holds a record of no run."""
+    """Raise ValueError if a folder is a file, or holds a record of no run."""
+    if folder.is_file():
+        raise ValueError(f"{folder} is a file: {GIVE_A_RUN}")
     path = folder / RECORD
     record = load_json(path) if path.exists() else {"config": {}}
     if "config" not in record:

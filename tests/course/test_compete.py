@@ -111,3 +111,68 @@ def test_sixty_submissions_of_which_seventeen_misbehave_on_fifty_tracks(tmp_path
             assert said in results[name]["failures"][0], name
             assert len(results[name]["failures"]) <= MOST_FAILURES
     assert all(not one["failures"] for name, one in results.items() if name not in MISBEHAVE)
+
+
+def test_results_under_other_conditions_are_refused_and_kept(held, capsys):
+    folder, _ = held
+    compete = ["compete", str(folder / "class"), "--secret", str(folder / "tracks.json")]
+    compete += ["--out", str(folder / "out"), "--no-baselines"]
+    before = [file.read_bytes() for file in sorted((folder / "out" / "results").iterdir())]
+    assert main([*compete, "--limits.start", "20", "--limits.step", "0.4"]) == 2
+    assert "was driven with other limits" in capsys.readouterr().err
+    other = folder / "other.json"
+    assert main(["commit", str(other), "--tracks", "2"]) == 0
+    compete[3] = str(other)
+    assert main([*compete, *SHORT]) == 2
+    assert "was driven with other tracks" in capsys.readouterr().err
+    assert [file.read_bytes() for file in sorted((folder / "out" / "results").iterdir())] == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        ("compete CLASS --secret SECRET --limits.total -1", "limits.total=-1: expected more than"),
+        ("compete CLASS --secret SECRET --limits.step nan", "limits.step=nan: expected more than"),
+        ("compete CLASS --secret SECRET --limits.memory inf", "limits.memory=inf: expected more"),
+        ("compete CLASS --secret SECRET --out CLASS/out", "lies in the folder of submissions"),
+        ("compete CLASS --secret AGENT", "is no file of hidden tracks"),
+        ("compete OURS --secret SECRET", "names with 'baseline-' are those of our agents"),
+        ("commit SECRET --tracks 7", "has 2 tracks, not 7"),
+        ("commit AGENT", "ending in .json"),
+        ("check nothing.py", "nothing.py does not exist: expected a Python file"),
+        ("kit nothing", "expected a name that ends in .py"),
+    ],
+)
+def test_what_would_cost_results_is_refused_in_one_line(arguments, expected, tmp_path, capsys):
+    write_class(tmp_path / "class", 1, ())
+    (tmp_path / "ours").mkdir()
+    agent = tmp_path / "ours" / "baseline-random.py"
+    agent.write_bytes((STARTER / "my_agent.py").read_bytes())
+    hide_tracks(tmp_path / "tracks.json", 2)
+    places = {"CLASS": "class", "SECRET": "tracks.json", "OURS": "ours"}
+    for name, place in places.items():
+        arguments = arguments.replace(name, str(tmp_path / place))
+    assert main(arguments.replace("AGENT", str(agent)).split()) == 2
+    captured = capsys.readouterr()
+    assert expected in captured.err and len(captured.err.strip().splitlines()) == 1
+    assert agent.read_bytes() == (STARTER / "my_agent.py").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("kit", ""),
+        ("check", ""),
+        ("commit", ""),
+        ("compete", "", "--secret", "tracks.json"),
+    ],
+)
+def test_an_empty_name_is_not_the_present_folder(arguments, capsys):
+    assert main(list(arguments)) == 2
+    assert "is empty" in capsys.readouterr().err
+
+
+def test_a_folder_without_an_agent_is_told_what_it_lacks(tmp_path):
+    (tmp_path / "notes").mkdir()
+    said = check_submission(tmp_path / "notes", Limits())
+    assert "neither agent.py with make_agent(), nor a run" in said
