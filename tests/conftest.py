@@ -24,25 +24,25 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
-import torch
 from filelock import FileLock
 from firefox import Firefox
-from torch.optim.optimizer import register_optimizer_step_post_hook
 
-import stad_lab.envs
-from stad_lab import Config, load_agent, make_env
-from stad_lab.envs.cars import Cars
-from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controller
-from stad_lab.models.controller import initial_parameters
+import stad_lab
 
 LIVE = Path(__file__).parent.parent / "docs" / "live"
 GAME = "```{include} race.md\n"  # how the story shows the game
-sys.path.insert(0, str(LIVE))
-import live_build  # noqa: E402
 
-torch.set_num_threads(1)  # the models here are tiny
+# What takes seconds to import is imported where it is used: the process that hands out the tests
+# runs none, and those that run them wait for it.
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread():
+    """PyTorch computes on one thread: the models here are tiny."""
+    import torch
+
+    torch.set_num_threads(1)
 
 
 def pytest_xdist_auto_num_workers():
@@ -152,9 +152,14 @@ def straight_run(quick_run, tmp_path_factory):
 
     It drives straight on, and leaves the field after some 300 frames.
     """
+    import numpy as np
+
+    from stad_lab.io.weights import CONTROLLER_FILE, load_controller, save_controller
+    from stad_lab.models.controller import initial_parameters
+
     folder = shutil.copytree(quick_run, tmp_path_factory.mktemp("runs") / "straight")
     _, metadata = load_controller(folder / CONTROLLER_FILE)
-    quick = Config.preset("quick")
+    quick = stad_lab.Config.preset("quick")
     straight = initial_parameters(quick.vae.latent_size, quick.mdn_rnn.hidden_size, gas=-0.2)
     gas = straight[:-3].reshape(3, -1)[1]
     gas[:] = 0.02 * np.random.default_rng(0).standard_normal(gas.shape)
@@ -166,13 +171,13 @@ def straight_run(quick_run, tmp_path_factory):
 @pytest.fixture
 def agent(quick_run):
     """The agent of the run."""
-    return load_agent(quick_run)
+    return stad_lab.load_agent(quick_run)
 
 
 @pytest.fixture(scope="session")
 def observations():
     """Sixty observations of one episode: a list of uint8 (96, 96, 3)."""
-    env = make_env()
+    env = stad_lab.make_env()
     seen = [env.reset(seed=7)[0]]
     env.action_space.seed(7)
     while len(seen) < 60:
@@ -184,6 +189,7 @@ def observations():
 @pytest.fixture(scope="session")
 def noted_tracks():
     """`with noted_tracks() as tracks:` lists the tracks on which this process resets a car."""
+    from stad_lab.envs.cars import Cars
 
     @contextmanager
     def note():
@@ -233,6 +239,8 @@ def interrupt_after():
 
     It returns a handle with a method `remove`.
     """
+    from torch.optim.optimizer import register_optimizer_step_post_hook
+
     handles = []
 
     def interrupt(updates):
@@ -254,6 +262,9 @@ def interrupt_after():
 @pytest.fixture(scope="module")
 def live_pages(tmp_path_factory):
     """A folder with the live pages as plain HTML, and all their scripts."""
+    sys.path.insert(0, str(LIVE))
+    import live_build
+
     folder = tmp_path_factory.mktemp("live")
     live_build.write_scripts(folder)
     for file in LIVE.glob("*.md"):

@@ -71,8 +71,14 @@ def lab(tmp_path_factory):
     server.wait(20)
 
 
+@pytest.fixture(scope="module")
+def tabs(browser):
+    """A window whose tabs share a cache: JupyterLab has megabytes of scripts."""
+    return browser.new_context(viewport={"width": 1300, "height": 1400})
+
+
 @pytest.fixture
-def run(lab, browser):
+def run(lab, tabs):
     """run(cells) writes a notebook of these code cells, runs it and returns the page.
 
     At the end of the test the page must not have reported an error.
@@ -82,7 +88,7 @@ def run(lab, browser):
 
     def run_notebook(*cells, name="test.ipynb", content=None):
         (folder / name).write_text(json.dumps(content or as_notebook(cells)))
-        page = browser.new_page(viewport={"width": 1300, "height": 1400})
+        page = tabs.new_page()
         pages.append(page)
         page.on("pageerror", lambda error: errors.append(str(error)))
         page.on(

@@ -1,9 +1,12 @@
 """The pages are up to date, short, linked and in plain words; the site builds without a network.
 
 The notebooks run in the suite already, each on its own. This build takes them without outputs and
-runs one small notebook in their place.
+runs one small notebook in their place. It has the reference of a few modules, while the docstrings
+of all are parsed one by one; `pytest -m long` builds the reference of every module.
 """
 
+import importlib
+import inspect
 import io
 import json
 import os
@@ -16,8 +19,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from docutils.core import publish_doctree
+from docutils.utils import SystemMessage
 from matplotlib.figure import Figure
 from PIL import Image
+from sphinx.ext.napoleon import Config, GoogleDocstring
 
 from stad_course import cli as course
 from stad_lab import cli, command_line
@@ -54,6 +60,7 @@ CELLS = (
     "import pandas\npandas.DataFrame({f'a long name {n}': [n] for n in range(20)})",
 )
 LAB = "someone/their_lab"  # a repository on GitHub
+NAMED = {"stad_lab.agent", "stad_lab.config", "stad_lab.doctor", "stad_lab.envs.car_racing"}
 SERIOUS = {"serious", "critical"}  # impacts of axe
 # axe's rule on contrast is slow. Ink and paper follow from tags, classes and styles, so of all
 # texts that have these alike, up to the root, one stays.
@@ -81,14 +88,32 @@ def small_notebook(*sources):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory):
-    """The site from a copy of its sources and one small notebook: (its folder, the process)."""
-    source = tmp_path_factory.mktemp("source")
+    """The site with the reference of those modules that a page names: as `build` returns it."""
+    return build(tmp_path_factory.mktemp("source"), set(blocks.modules()) - NAMED)
+
+
+@pytest.fixture(scope="module")
+def whole_site(tmp_path_factory):
+    """The site with the reference of all modules: as `build` returns it."""
+    return build(tmp_path_factory.mktemp("source"), set())
+
+
+def build(source, left_out):
+    """The site from a copy of its sources and one small notebook: (its folder, the process).
+
+    Args:
+        left_out: modules whose pages are not built.
+    """
     ignored = shutil.ignore_patterns("_*", "modules", ".ipynb_*")
     for folder in ("docs", "notebooks"):
         shutil.copytree(ROOT / folder, source / folder, ignore=ignored)
     for name, file in PAGES.items():
         (source / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(file, source / name)
+    reference = source / "docs" / "reference.md"
+    lines = reference.read_text(encoding="utf-8").splitlines(keepends=True)
+    kept = (line for line in lines if line.strip() not in left_out)
+    reference.write_text("".join(kept), encoding="utf-8")
     (source / "notebooks" / "00_small.ipynb").write_text(small_notebook(*CELLS))
     notebooks = [f"notebooks/{file.name}" for file in (ROOT / "notebooks").glob("0*.ipynb")]
     out = source / "docs" / "_build" / "site"
@@ -212,17 +237,54 @@ def test_a_notebook_for_colab_installs_first_and_has_no_relative_link(tmp_path):
         colab.main(f"https://github.com/{LAB}", str(tmp_path))
 
 
-def test_the_site_builds_without_a_warning(site):
-    _, process = site
+def assert_built(built, modules):
+    """A site was built without a warning, with the pages of these modules and no others."""
+    folder, process = built
     assert process.returncode == 0, process.stdout + process.stderr
+    assert {file.stem for file in (folder / "docs" / "modules").glob("*.html")} == modules
 
 
-def test_every_notebook_and_module_has_its_page_and_the_index_of_words_is_there(site):
+def test_the_site_builds_without_a_warning(site):
+    assert_built(site, NAMED)
+
+
+@pytest.mark.long
+def test_the_site_with_a_page_of_every_module_builds_without_a_warning(whole_site):
+    assert_built(whole_site, set(blocks.modules()))
+
+
+def documented(module):
+    """The docstrings that the reference shows of a module: (name, docstring)."""
+    waiting = [(module.__name__, module)]
+    while waiting:
+        name, one = waiting.pop()
+        yield name, inspect.getdoc(one) or ""
+        if inspect.ismodule(one) or inspect.isclass(one):
+            for key, value in vars(one).items():
+                value = getattr(value, "__func__", value)
+                own = getattr(value, "__module__", None) == module.__name__
+                shown = inspect.isroutine(value) or inspect.isclass(value)
+                if (own and shown) or isinstance(value, property):
+                    waiting.append((f"{name}.{key}", value))
+
+
+@pytest.mark.parametrize("name", blocks.modules())
+def test_every_docstring_of_a_module_is_right_restructuredtext(name):
+    config = Config(napoleon_numpy_docstring=False, napoleon_use_ivar=True)
+    strict = {"halt_level": 2, "report_level": 5, "_disable_config": True}
+    for where, docstring in documented(importlib.import_module(name)):
+        text = ".. default-role:: code\n\n" + str(GoogleDocstring(docstring, config))
+        try:
+            publish_doctree(text, settings_overrides=strict)
+        except SystemMessage as error:
+            pytest.fail(f"{where}: {error}\n{text}")
+
+
+def test_every_notebook_has_its_page_and_the_index_of_words_is_there(site):
     folder, _ = site
     notebooks = {file.stem for file in (ROOT / "notebooks").glob("*.ipynb")}
     assert notebooks <= {file.stem for file in (folder / "notebooks").glob("*.html")}
     pages = {file.stem: file for file in (folder / "docs" / "modules").glob("*.html")}
-    assert set(blocks.modules()) == set(pages)
     assert "load_agent" in pages["stad_lab.agent"].read_text(encoding="utf-8")
     index = (folder / "searchindex.js").read_text(encoding="utf-8")
     assert "notebooks/02b_what_latents_carry" in index
@@ -314,8 +376,8 @@ def test_axe_finds_nothing_serious_in_either_theme(site, browser):
 
 
 @pytest.mark.long
-def test_axe_finds_nothing_serious_on_any_other_page(site, browser):
-    check_accessible(kinds_of_pages(site[0])[1], browser)
+def test_axe_finds_nothing_serious_on_any_other_page(whole_site, browser):
+    check_accessible(kinds_of_pages(whole_site[0])[1], browser)
 
 
 def test_a_film_can_be_paused_and_begins_still_for_who_wants_no_motion(site, browser):
@@ -331,13 +393,15 @@ def test_a_film_can_be_paused_and_begins_still_for_who_wants_no_motion(site, bro
         page.close()
 
 
-@pytest.mark.parametrize("width", [390, 1100, 1300])
-def test_no_page_is_wider_than_its_window(width, site, browser):
-    page = browser.new_page(viewport={"width": width, "height": 900})
+def test_no_page_is_wider_than_its_window(site, browser):
+    page = browser.new_page()
     for file in kinds_of_pages(site[0])[0]:
+        page.set_viewport_size({"width": 390, "height": 900})
         page.goto(file.as_uri())
-        wide = page.evaluate(
-            "document.querySelector('article')?.getBoundingClientRect().right ?? 0"
-        )
-        assert wide <= width, file
+        for width in (390, 1100, 1300):
+            page.set_viewport_size({"width": width, "height": 900})
+            wide = page.evaluate(
+                "document.querySelector('article')?.getBoundingClientRect().right ?? 0"
+            )
+            assert wide <= width, file
     page.close()

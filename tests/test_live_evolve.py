@@ -20,51 +20,66 @@ def evolve(page, generations):
         page.wait_for_function(f"stad.page.log.length > {done} && !stad.page.busy")
 
 
-@pytest.fixture
-def evolved(opened):
-    """A page after two small generations."""
-    page = opened("evolve", SMALL)
+@pytest.fixture(scope="module")
+def running(browser, live_pages):
+    """A page after two small generations, which draws seldom, and its errors."""
+    page, errors = browser.new_page(reduced_motion="reduce"), []
+    page.set_default_timeout(60_000)  # milliseconds: a busy machine is no fault
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
+    page.goto((live_pages / "evolve.html").as_uri() + SMALL)
+    page.wait_for_selector("#live[data-state=ready]")
     evolve(page, 2)
-    return page
+    yield page, errors
+    page.close()
 
 
-def test_a_driver_from_the_page_scores_the_same_in_python(evolved, tmp_path):
-    with evolved.expect_download() as started:
-        evolved.click("#download")
-    file = tmp_path / started.value.suggested_filename
-    started.value.save_as(file)
-    parameters, metadata = load_controller(file)
-    assert np.array_equal(parameters[:32], evolved.evaluate("stad.page.states.at(-1).mean")[:32])
-    assert metadata["generation"] == 2 and metadata["seed"] == 3
-    # The next generation lets this mean drive along.
-    evolve(evolved, 1)
-    (page_score,) = evolved.evaluate("stad.page.log[2].mean")
-    track = evolved.evaluate("stad.page.view.map.track.seed")
-    agent = load_agent("frame", file)
-    (score,) = drive(agent, [track], patience=50).returns
-    # z differs by rounding, so a car may touch a tile a moment earlier or later.
-    assert score == pytest.approx(page_score, abs=2 * TILE)
+@pytest.fixture
+def evolved(running):
+    """A page after two or more generations: a generation takes seconds, so tests share the page."""
+    page, errors = running
+    yield page
+    assert not errors
 
 
 def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
-    page = evolved
+    page, done = evolved, evolved.evaluate("stad.page.log.length")
     page.reload()
     page.wait_for_selector("#live[data-state=ready]")
-    assert page.evaluate("stad.page.log.length") == 2
+    assert page.evaluate("stad.page.log.length") == done
     evolve(page, 1)
-    resumed = page.evaluate(LOG, 3)
+    resumed = page.evaluate(LOG, done + 1)
     page.click("summary")
     page.fill("#seed", "-5")
     page.click("#restart")
     assert "-5" in page.inner_text("#warning")
     page.fill("#seed", "3")
     page.click("#restart")  # one click asks, so nothing is lost by it
-    assert "generation 3" in page.inner_text("#warning")
-    assert page.evaluate("stad.page.log.length") == 3
+    assert f"generation {done + 1}" in page.inner_text("#warning")
+    assert page.evaluate("stad.page.log.length") == done + 1
     page.click("#restart")
     page.wait_for_function("stad.page.log.length === 0")
-    evolve(page, 3)
-    assert page.evaluate(LOG, 3) == resumed
+    evolve(page, done + 1)
+    assert page.evaluate(LOG, done + 1) == resumed
+
+
+def test_a_driver_from_the_page_scores_the_same_in_python(evolved, tmp_path):
+    done = evolved.evaluate("stad.page.log.length")
+    with evolved.expect_download() as started:
+        evolved.click("#download")
+    file = tmp_path / started.value.suggested_filename
+    started.value.save_as(file)
+    parameters, metadata = load_controller(file)
+    assert np.array_equal(parameters[:32], evolved.evaluate("stad.page.states.at(-1).mean")[:32])
+    assert metadata["generation"] == done and metadata["seed"] == 3
+    # The next generation lets this mean drive along.
+    evolve(evolved, 1)
+    (page_score,) = evolved.evaluate("stad.page.log.at(-1).mean")
+    track = evolved.evaluate("stad.page.view.map.track.seed")
+    agent = load_agent("frame", file)
+    (score,) = drive(agent, [track], patience=50).returns
+    # z differs by rounding, so a car may touch a tile a moment earlier or later.
+    assert score == pytest.approx(page_score, abs=2 * TILE)
 
 
 def test_the_evolved_driver_is_the_rival_in_the_race(evolved, opened):

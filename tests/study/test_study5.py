@@ -17,7 +17,7 @@ from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training.evolution import LOG
 from stad_lab.training.trainer import torch_settings
-from stad_study import tables, world_facts
+from stad_study import senses, tables, world_facts
 from stad_study.evolved import find_runs, run_evolved
 from stad_study.networks import WORLD_MODEL_FILE, keep_world_model, load_kept_world_model
 from stad_study.senses import (
@@ -56,6 +56,7 @@ def networks(tmp_path_factory):
         patch.setitem(STUDIES, "study1", dataclasses.replace(STUDIES["study1"], **tiny))
         patch.setattr(world_facts, "PROBED", 12)
         patch.setattr(world_facts, "PLACEBO_EPISODES", 2)
+        patch.setattr(senses, "DRAWS", 1000)
         yield folder
 
 
