@@ -209,7 +209,7 @@ def test_kept_agents_are_driven_on_any_tracks_by_one_command(made, tmp_path, mon
     assert main([*command, "--json", str(tmp_path / "record.json")]) == 2
     assert "name of a run's own file" in capsys.readouterr().err
     assert main([*command, "--seeds", "1"]) == 2
-    assert "make them with `python -m stad_study replicate tiny`" in capsys.readouterr().err
+    assert "make them with `python -m stad_study replicate tiny --out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
