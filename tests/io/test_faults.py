@@ -249,14 +249,12 @@ def test_a_file_that_may_not_be_read_is_an_error_that_says_so(whole, tmp_path):
 # Runs of earlier versions
 
 
-def test_a_run_of_the_first_edition_is_refused_with_the_version_that_continues_it(
-    whole, tmp_path, capsys
-):
+def test_a_run_of_the_first_edition_is_refused_and_left_as_it_is(whole, tmp_path, capsys):
     folder = tmp_path / "first"
     record = {"settings": {"episodes": 8}, "variant": "input_output", "seconds": {}}
     save_json(folder / "record.json", record)
     before = snapshot(folder)
-    error = f"{folder} holds a run of stad_lab 0.1: continue it with that version, or choose"
+    error = f"{folder / 'record.json'} is of 'input_output', no run: choose another folder"
     for again in (train_again, verify, read_finished):
         with pytest.raises(ValueError, match=re.escape(error)):
             again(folder)
