@@ -25,10 +25,9 @@ def hide_tracks(file: Path, count: int | None = None) -> str:
         if count not in (None, len(tracks)):
             raise ValueError(f"{file} has {len(tracks)} tracks, not {count}: choose another file")
         return commitment
-    else:
-        tracks = [SEEDS.start + secrets.randbelow(len(SEEDS)) for _ in range(count or COUNT)]
-        # The salt keeps anyone from trying all seeds until a hash fits.
-        save_json(file, {"kind": KIND, "tracks": tracks, "salt": secrets.token_hex(32)})
+    tracks = [SEEDS.start + secrets.randbelow(len(SEEDS)) for _ in range(count or COUNT)]
+    # The salt keeps anyone from trying all seeds until a hash fits.
+    save_json(file, {"kind": KIND, "tracks": tracks, "salt": secrets.token_hex(32)})
     return load_tracks(file)[1]
 
 
