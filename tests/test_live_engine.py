@@ -16,11 +16,7 @@ from stad_lab.evaluation.evaluate import evaluate
 
 LIVE = Path(__file__).parent.parent / "docs" / "live"
 sys.path.insert(0, str(LIVE))
-with pytest.MonkeyPatch.context() as patch:
-    # Its import chooses a processor without any extension, for this process and all that it starts.
-    patch.setenv("NUMBA_CPU_NAME", "")
-    patch.setenv("NUMBA_CPU_FEATURES", "")
-    import wasm_build
+import wasm_build  # noqa: E402, its folder is not that of the tests
 
 CLOSE = 1e-5  # of z, h and actions, where this processor multiplies and adds in one rounding
 PICTURED = (0, 1, 7, 60, 150)  # frames whose pictures are compared

@@ -16,9 +16,6 @@ import sys
 import tempfile
 from pathlib import Path
 
-# For any processor: the module must not depend on the one that makes it.
-os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = "generic", ""
-
 HERE = Path(__file__).parent
 ENGINE, FACTS = HERE / "engine" / "engine.wasm", HERE / "engine" / "engine.json"
 TABLES = HERE / "engine" / "tables.bin"
@@ -265,6 +262,8 @@ def main() -> int:
         return int(bool(found))
     with tempfile.TemporaryDirectory() as cache:
         os.environ["NUMBA_CACHE_DIR"] = cache
+        # For any processor: the module must not depend on the one that makes it.
+        os.environ["NUMBA_CPU_NAME"], os.environ["NUMBA_CPU_FEATURES"] = "generic", ""
         build()
     return 0
 
