@@ -100,8 +100,10 @@ def one_line(message: str) -> str:
     lines = [re.sub(r"[─│╭╮╰╯]+|-{9,}", "", line).strip() for line in message.splitlines()]
     kept = [line for line in lines if line and line.lower() != "error"]
     text = re.split("Argument helptext|For full helptext", " ".join(kept))[0]
-    title = "^(Value error|Parsing error|Unrecognized options|Required options|Invalid choice) "
-    text = re.sub(title, "", text).replace("subcommand Expected", "subcommand: expected")
+    titles = "Value error|Parsing error|Unrecognized options|Required options|Invalid choice"
+    text = re.sub(f"^({titles}|Missing argument) ", "", text).replace(
+        "subcommand Expected", "subcommand: expected"
+    )
     return text.strip().rstrip(".")
 
 
