@@ -33,19 +33,13 @@ from stad_lab.training.record import provenance
 from stad_study import tables
 from stad_study.networks import NETWORKS
 from stad_study.senses import Sense
-from stad_study.study import CARS, SCORE, STUDIES, WAIT, fixed_threads
+from stad_study.study import CARS, SCORE, STUDIES, WAIT, Run, fixed_threads, select
 
 CHECKSUMS = ("log", "controller", "returns")
 
 
-class Run(Protocol):
+class Evolution(Run, Protocol):
     """One C: a NamedTuple of a seed and what the study varies."""
-
-    seed: int
-
-    @property
-    def name(self) -> str:
-        """Its folder, below that of the study."""
 
     @property
     def config(self) -> Config:
@@ -77,15 +71,7 @@ def find_runs(
 ) -> list[Any]:
     """The runs of a study, part by part. ValueError for an unknown seed or name."""
     found = [run for runs in study.parts(to).values() for run in runs]
-    planned, names = {run.seed for run in found}, [run.name for run in found]
-    if other := set(seeds or ()) - planned:
-        known = f"{min(planned)} to {max(planned)}"
-        raise ValueError(f"{study.name} has no seed {min(other)}: it has {known}")
-    if unknown := [name for name in only or [] if name not in names]:
-        example = f"expected a name such as {names[0]!r}"
-        raise ValueError(f"{study.name} has no run {unknown[0]!r}: {example}")
-    found = [run for run in found if not seeds or run.seed in seeds]
-    return [run for run in found if not only or run.name in only]
+    return select(study.name, found, seeds, only)
 
 
 def count_runs(study: Evolved, to: Path = tables.DATA) -> dict[str, tuple[int, int]]:
@@ -139,7 +125,7 @@ def run_evolved(
     print(describe_progress(study, to))
 
 
-def run_one(study: Evolved, run: Run, root: Path, networks: Path = NETWORKS) -> dict:
+def run_one(study: Evolved, run: Evolution, root: Path, networks: Path = NETWORKS) -> dict:
     """Do what is missing of a run; returns its score."""
     folder, kept = root / run.name, networks / study.name / run.name
     if (folder / SCORE).exists():
@@ -181,7 +167,7 @@ def score_controller(sense: Sense, controller: np.ndarray) -> dict:
     }
 
 
-def add_run(study: Evolved, run: Run, root: Path, to: Path) -> None:
+def add_run(study: Evolved, run: Evolution, root: Path, to: Path) -> None:
     """Add a finished run to the tables: its line of runs, and its returns rounded to cents."""
     score, key = load_json(root / run.name / SCORE, kind="score"), run._asdict()
     tracks = STUDIES["study1"].tracks
@@ -194,7 +180,7 @@ def add_run(study: Evolved, run: Run, root: Path, to: Path) -> None:
         tables.replace_lines(f"{study.name}_runs", line, to)
 
 
-def describe_run(run: Run, root: Path) -> dict:
+def describe_run(run: Evolution, root: Path) -> dict:
     """The line of runs: score, learning curve, machine, seconds and checksums."""
     score = load_json(root / run.name / SCORE, kind="score")
     log = load_json(root / run.name / LOG)
@@ -212,7 +198,7 @@ def describe_run(run: Run, root: Path) -> dict:
     return line | {"returns": checksum_of_arrays(returns=returns)}
 
 
-def keep_controller(study: Evolved, run: Run, controller: np.ndarray, folder: Path) -> None:
+def keep_controller(study: Evolved, run: Evolution, controller: np.ndarray, folder: Path) -> None:
     """Add a C to the file of its seed: float16 (parameters,) under the name of the run."""
     path = folder / f"seed{run.seed}.safetensors"
     tensors = load_tensors(path)[0] if path.exists() else {}
@@ -220,14 +206,14 @@ def keep_controller(study: Evolved, run: Run, controller: np.ndarray, folder: Pa
     save_tensors(path, dict(sorted(tensors.items())), kind="controllers", study=study.name)
 
 
-def recorded(study: Evolved, run: Run, to: Path = tables.DATA) -> dict | None:
+def recorded(study: Evolved, run: Evolution, to: Path = tables.DATA) -> dict | None:
     """The line of a run in the table of runs; None if it is not there."""
     table = tables.read_or_empty(f"{study.name}_runs", to)
     own = table[(table[study.key] == list(run._asdict().values())).all(axis=1)]
     return own.iloc[0].to_dict() if len(own) else None
 
 
-def compare(run: Run, was: dict, root: Path) -> str:
+def compare(run: Evolution, was: dict, root: Path) -> str:
     """Whether a run that was repeated is, bit by bit, the one in the tables."""
     now = describe_run(run, root)
     differs = [name for name in CHECKSUMS if was[name] != now[name]]

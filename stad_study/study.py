@@ -18,7 +18,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import pandas
@@ -113,17 +113,39 @@ def find_pipelines(
     if study not in STUDIES:
         raise ValueError(f"unknown study {study!r}: choose one of {', '.join(STUDIES)}")
     asked = STUDIES[study]
-    if other := set(seeds or ()) - set(asked.seeds):
-        known = f"{min(asked.seeds)} to {max(asked.seeds)}"
-        raise ValueError(f"study {study!r} has no seed {min(other)}: it has {known}")
-    chosen = [seed for seed in asked.seeds if not seeds or seed in seeds]
     arms = [(variant, features) for variant in asked.variants for features in asked.features]
-    found = [Pipeline(study, *arm, seed) for seed in chosen for arm in arms]
-    names = [pipeline.name for pipeline in found]
+    found = [Pipeline(study, *arm, seed) for seed in asked.seeds for arm in arms]
+    return select(study, found, seeds, only)
+
+
+class Run(Protocol):
+    """What a study runs and counts."""
+
+    @property
+    def seed(self) -> int:
+        """That of its world."""
+
+    @property
+    def name(self) -> str:
+        """Its folder, below that of the study."""
+
+
+AnyRun = TypeVar("AnyRun", bound=Run)
+
+
+def select(
+    study: str, runs: list[AnyRun], seeds: Sequence[int] | None, only: Sequence[str] | None
+) -> list[AnyRun]:
+    """Those of some seeds, or some by name. ValueError for an unknown seed or name."""
+    planned, names = {run.seed for run in runs}, [run.name for run in runs]
+    if other := set(seeds or ()) - planned:
+        known = f"{min(planned)} to {max(planned)}"
+        raise ValueError(f"study {study!r} has no seed {min(other)}: it has {known}")
     if unknown := [name for name in only or [] if name not in names]:
         example = f"expected a name such as {names[0]!r}"
-        raise ValueError(f"study {study!r} has no pipeline {unknown[0]!r}: {example}")
-    return [pipeline for pipeline in found if not only or pipeline.name in only]
+        raise ValueError(f"study {study!r} has no run {unknown[0]!r}: {example}")
+    chosen = [run for run in runs if not seeds or run.seed in seeds]
+    return [run for run in chosen if not only or run.name in only]
 
 
 def run_study(

@@ -15,7 +15,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stad_lab.config import Config
-from stad_lab.io.files import copy_file, locked
+from stad_lab.io.files import copy_file, locked, save_json
+from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_mdn_rnn, load_vae
 from stad_lab.training.pipeline import train
 from stad_lab.training.record import RECORD
 from stad_study import tables
@@ -28,6 +29,7 @@ SEEDS = range(300, 305)
 PASSED = 780.0  # points that each run of the gate must reach
 GATE = {4: SEEDS[:2], 1: SEEDS[:2], 16: SEEDS[:1]}  # episodes of a candidate -> seeds
 CONFIG = Config.preset("paper", processes=1)
+TRAINING = "training.json"  # what the files of V and M say of their training
 
 
 class Run(NamedTuple):
@@ -93,12 +95,17 @@ def prepare(run: Run, root: Path, networks: Path) -> Sense:
 
 
 def train_world(run: Run, seed: Path, kept: Path) -> None:
-    """Train V and M of a seed and variant in the folder `seed`, and keep them with their record."""
+    """Train V and M of a seed and variant in the folder `seed`; keep them, record and losses."""
     config, folder = run.config, seed / run.variant
     with locked(seed, COLLECTING):
         train(config, folder, seed / "dataset", until="mdn_rnn")
     keep_world_model(config, folder, kept)
     copy_file(folder / RECORD, kept.parent)
+    losses = {
+        "vae": load_vae(folder / VAE_FILE)[1],
+        "mdn_rnn": load_mdn_rnn(folder / MDN_RNN_FILE)[1],
+    }
+    save_json(kept.with_name(TRAINING), losses)
 
 
 STUDY2 = Evolved("study2", parts_of_study2, prepare, keeps_logs=True)

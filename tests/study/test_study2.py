@@ -76,6 +76,11 @@ def test_a_run_continues_from_the_log_that_is_kept_of_it(tmp_path, monkeypatch, 
     evolved.run_one(STUDY2, run, tmp_path / "stopped", networks)
     kept = networks / "study2" / run.name / LOG
     assert np.shape(load_json(kept)["generations"][1]["returns"]) == (4, 4)  # candidates, episodes
+    losses = load_json(kept.parents[1] / study2.TRAINING)
+    assert {name: one["history"][-1]["step"] for name, one in losses.items()} == {
+        "vae": quick(2).vae.steps,
+        "mdn_rnn": quick(2).mdn_rnn.steps,
+    }
     monkeypatch.setattr(study2, "CONFIG", quick(4))
     to = {"only": [run.name], "to": tmp_path / "data", "networks": networks}
     run_evolved(STUDY2, tmp_path / "elsewhere", **to)
