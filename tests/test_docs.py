@@ -41,8 +41,9 @@ import renew  # noqa: E402
 from site_check import faults  # noqa: E402
 
 PAGES = {file.relative_to(ROOT).as_posix(): file for file in renew.pages()}
-# words; any other page 1,500. The protocol holds six studies and its log.
-LIMITS = {"README.md": 900, "docs/instructor.md": 2500, "docs/protocol.md": 3000}
+# words; any other page 1,500. The protocol holds six studies; nothing is taken out of its log.
+LIMITS = {"README.md": 900, "docs/instructor.md": 2500, "docs/protocol.md": 1700}
+LIMITS["docs/protocol-log.md"] = 3000
 # Words of our own for which the field has others.
 PRIVATE = (
     r"luck\w*|redraw\w*|foresee\w*|forecast\w*|honest\w*|mutants?|second round|going back|floors?|"
