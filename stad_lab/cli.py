@@ -73,10 +73,10 @@ def training_command(config: Config) -> Callable:
         scheduler: str | None = None,
         tensorboard: bool = False,
     ) -> None:
-        """Collect a dataset, train V, train M, evolve C: `train [quick|laptop|paper] --out RUN`.
+        """Collect a dataset, train V, train M, evolve C: `train [PRESET] --out RUN`.
 
-        Stop it when you like; the same command continues. The preset is that of $STAD_LAB_PRESET,
-        or else laptop, if none is named.
+        Stop it when you like; the same command continues. The preset is quick, fast, laptop or
+        paper; if none is named, that of $STAD_LAB_PRESET, or else laptop.
 
         Args:
             out: Folder of the run, for example runs/input.

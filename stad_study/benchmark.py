@@ -4,7 +4,7 @@
     renderer    frames a second on one core: Gymnasium, EnvPool if it is installed, and our engine
     loop        frames a second with V + M + C driving, and where the time of a frame goes
     training    images and frames a second of V and M in training
-    run         minutes of a whole run of the laptop preset, from nothing to the evaluated agent
+    run         minutes of whole runs of two presets, from nothing to the evaluated agent
 
 Speeds depend on the machine, so contenders do the same work in turns, in alternating order, and the
 median of the rounds counts. On an otherwise idle machine the run takes about twenty minutes, and
@@ -53,7 +53,7 @@ from stad_lab.training.vae import vae_training
 from stad_study.parity import AREAS, compare_pictures
 
 SOURCE = "input"  # the shipped agent that drives, and the variant that is trained
-PRESET = "laptop"  # of the whole run
+WHOLE_RUNS = "fast", "laptop"  # presets; the agent of the last one drives with Gymnasium, too
 GYMNASIUM, ENVPOOL = "Gymnasium", "EnvPool"
 CARS = 16  # in a batch
 V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, the first of them not timed
@@ -310,19 +310,27 @@ def training_speed(training: Training, items: int) -> float:
 
 
 def measure_run(rounds: int) -> dict:
-    """One whole run, and the evaluation of its agent on 100 tracks with either renderer."""
-    config = Config.preset(PRESET, variant=SOURCE)
+    """A whole run of each preset, with the evaluation of its agent on 100 tracks."""
+    return {
+        f"minutes of a whole run, {preset}": time_run(preset, gymnasium=preset == WHOLE_RUNS[-1])
+        for preset in WHOLE_RUNS
+    }
+
+
+def time_run(preset: str, gymnasium: bool) -> dict[str, float]:
+    """Minutes of each stage of one run, evaluated with our engine and, if asked, Gymnasium."""
+    config = Config.preset(preset, variant=SOURCE)
     with tempfile.TemporaryDirectory() as folder:
         begin = time.perf_counter()
         train(config, folder)
         seconds = load_json(Path(folder) / RECORD)["seconds"]
         seconds = {stage: seconds[stage] for stage in STAGES}
         seconds["all else"] = time.perf_counter() - begin - sum(seconds.values())
-        for fast, name in ((True, "our engine"), (False, GYMNASIUM)):
+        for fast, name in ((True, "our engine"), (False, GYMNASIUM))[: 1 + gymnasium]:
             begin = time.perf_counter()
             evaluate(folder, fast=fast, processes=config.processes)
             seconds[f"evaluation with {name}"] = time.perf_counter() - begin
-    return {"minutes of a whole run": {name: own / 60 for name, own in seconds.items()}}
+    return {name: own / 60 for name, own in seconds.items()}
 
 
 PARTS = {

@@ -14,7 +14,14 @@ from stad_lab.agent import PRETRAINED
 from stad_lab.evaluation import statistics
 from stad_lab.io.files import load_json, write_bytes
 from stad_lab.training.record import total_budget
-from stad_study import measurements, study2_claims, study5_claims, study_claims, tables
+from stad_study import (
+    measurements,
+    study2_claims,
+    study5_claims,
+    study6_claims,
+    study_claims,
+    tables,
+)
 from stad_study.experiments import BASELINE_DRIVERS, EXPERIMENTS
 
 CLAIMS = tables.DATA / "claims.json"
@@ -33,6 +40,7 @@ def compute_claims() -> dict[str, dict]:
         "study2": study2_claims.describe_study2(),
         "study3": study_claims.describe_study3(),
         "study5": study5_claims.describe_study5(),
+        "study6": study6_claims.describe_study6(),
         "agents": describe_agents(),
         "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
         "probe": measurements.describe_probe(tables.read("probe")),

@@ -30,7 +30,8 @@ def replicate(
     pipelines of a study are added to the tables of stad_study/data as they finish.
 
     Args:
-        experiment: Its name: study1, study2, study5, pilot, or one of docs/experiments.md.
+        experiment: Its name: study1, study2, study5, study6_laptop, study6_fast, pilot, or one
+            of docs/experiments.md.
         out: Folder of all experiments, for example runs/replication.
         seeds: Some of its seeds; all if not given.
         only: Some pipelines of a study, such as seed0/frame/z, or runs of study5 or study2, such
@@ -134,7 +135,7 @@ def claims() -> None:
 
 def latents(
     out: str,
-    preset: Literal["quick", "laptop", "paper"] = "laptop",
+    preset: Literal["quick", "fast", "laptop", "paper"] = "laptop",
     parts: tuple[Literal["probe", "vae", "mdn_rnn"], ...] = (),
     dataset: Path | None = None,
 ) -> None:

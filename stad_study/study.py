@@ -74,11 +74,17 @@ class Study:
     config: Config = field(default_factory=lambda: Config.preset("laptop"))
     tracks: range = STUDY_TRACKS
     max_frames: int = 1000  # of an episode of the score, which has no patience
+    keeps_networks: bool = True  # beside the tables, so that anyone can drive them again
 
 
+PAIRS = range(200, 206), ("frame", "input_output"), ("z, h",)  # seeds, variants, features
 STUDIES = {
     "study1": Study("Do difference images earn points?", range(12)),
     "pilot": Study("a seed outside study1", (100,), ("frame", "input_output")),
+    "study6_laptop": Study("the laptop preset", *PAIRS, keeps_networks=False),
+    "study6_fast": Study(
+        "the fast preset", *PAIRS, config=Config.preset("fast"), keeps_networks=False
+    ),
 }
 
 
@@ -306,8 +312,9 @@ def add_pipeline(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> None
     log, score = load_json(run / LOG), load_json(run / SCORE, kind="score")
     kept = kept_file(pipeline, root / "networks")
     with locked(networks, WAIT):
-        for file in (kept.with_name(WORLD_MODEL_FILE), kept):
-            copy_file(file, kept_file(pipeline, networks).parent)
+        if STUDIES[pipeline.study].keeps_networks:
+            for file in (kept.with_name(WORLD_MODEL_FILE), kept):
+                copy_file(file, kept_file(pipeline, networks).parent)
         driven = pandas.DataFrame(score["episodes"]).rename(columns={"frames": "length"})
         generations = describe_generations(log["generations"], load_json(seed_record(run)))
         line = pandas.DataFrame([describe_run(pipeline, root)])

@@ -301,7 +301,7 @@ def test_a_wrong_name_or_value_ends_in_one_clear_line(options, parts, tmp_path, 
 @pytest.mark.parametrize(
     ("command", "message"),
     [
-        ("train fast --out run", "unknown preset 'fast': choose one of quick, laptop, paper"),
+        ("train fats --out run", "unknown preset 'fats': choose one of quick, fast, laptop, paper"),
         ("compet --help", "unknown command 'compet': choose one of train, fine-tune"),
         ("train quick", "--out"),
         ("", "Missing subcommand"),

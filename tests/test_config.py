@@ -40,10 +40,10 @@ def test_the_environment_variable_names_the_preset(monkeypatch):
 
 
 def test_an_unknown_preset_is_refused_with_the_choices(monkeypatch):
-    with pytest.raises(ValueError, match="'fast': choose one of quick, laptop, paper"):
-        Config.preset("fast")
+    with pytest.raises(ValueError, match="'fats': choose one of quick, fast, laptop, paper"):
+        Config.preset("fats")
     monkeypatch.setenv("STAD_LAB_PRESET", "huge")
-    with pytest.raises(ValueError, match="'huge': choose one of quick, laptop, paper"):
+    with pytest.raises(ValueError, match="'huge': choose one of quick, fast, laptop, paper"):
         Config.preset()
 
 

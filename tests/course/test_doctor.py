@@ -257,7 +257,9 @@ def test_an_unknown_preset_is_red_and_names_the_presets(monkeypatch):
     monkeypatch.setenv("STAD_LAB_PRESET", "lapptop")
     (wrong,) = doctor.check_preset()
     assert (
-        wrong.state == "red" and "lapptop" in wrong.found and "quick, laptop, paper" in wrong.remedy
+        wrong.state == "red"
+        and "lapptop" in wrong.found
+        and "quick, fast, laptop, paper" in wrong.remedy
     )
 
 

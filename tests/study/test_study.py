@@ -1,5 +1,6 @@
 """A study: whole pipelines into the tables, kept in half precision, and repeated bit by bit."""
 
+import dataclasses
 import shutil
 import subprocess
 import sys
@@ -50,6 +51,13 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     run_study("tiny", folder, seeds=[0], to=folder / "data")
     return folder
+
+
+def test_a_study_may_keep_no_networks(made, tmp_path, monkeypatch):
+    monkeypatch.setitem(STUDIES, "tiny", dataclasses.replace(TINY, keeps_networks=False))
+    pipeline, to = find_pipelines("tiny", [0])[0], tmp_path / "data"
+    study.add_pipeline(pipeline, made / "tiny", to)
+    assert study.recorded(pipeline, to) and not [*tmp_path.rglob("*.safetensors")]
 
 
 def logs(folder):

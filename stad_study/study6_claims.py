@@ -1,0 +1,51 @@
+"""The test of study 6 that docs/protocol.md fixes: is the faster recipe not worse?
+
+It is computed once all pairs are in the tables.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from scipy import stats
+
+from stad_study import tables
+from stad_study.study import STUDIES
+from stad_study.study_claims import MARGIN, describe_progress, returns_of_study
+
+RECIPES = "study6_laptop", "study6_fast"
+
+
+def describe_study6(folder: Path = tables.DATA) -> dict:
+    """Progress by recipe; and after the last pipeline scores, difference, bound and "not_worse"."""
+    runs = tables.read_study("runs", folder)
+    progress = {
+        name: describe_progress(STUDIES[name], runs[runs["study"] == name]) for name in RECIPES
+    }
+    found: dict = {
+        "pipelines": {name: one["pipelines"] for name, one in progress.items()},
+        "planned": {name: one["planned_pipelines"] for name, one in progress.items()},
+    }
+    if found["pipelines"] != found["planned"]:
+        return found
+    scores = {name: scores_of(name, folder) for name in RECIPES}
+    differences = scores["study6_fast"] - scores["study6_laptop"]
+    bound = lower_bound(differences)
+    return found | {
+        "scores": {name: own.tolist() for name, own in scores.items()},
+        "difference": float(differences.mean()),
+        "lower_bound": bound,
+        "not_worse": bound > -MARGIN,
+    }
+
+
+def scores_of(study: str, folder: Path) -> np.ndarray:
+    """The mean return of each pipeline, variant by variant, float64 (pairs,)."""
+    arms = returns_of_study(study, folder)
+    return np.concatenate([returns.mean(axis=1) for returns in arms.values()])
+
+
+def lower_bound(differences: np.ndarray) -> float:
+    """The lower end of the one-sided 95% interval of the mean, by Student's t."""
+    return float(
+        differences.mean() + stats.t.ppf(0.05, len(differences) - 1) * stats.sem(differences)
+    )
