@@ -311,7 +311,7 @@ def add_pipeline(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> None
     networks = to.parent / NETWORKS.name / pipeline.study
     log, score = load_json(run / LOG), load_json(run / SCORE, kind="score")
     kept = kept_file(pipeline, root / "networks")
-    with locked(networks, WAIT):
+    with locked(to, WAIT):  # studies share tables
         if STUDIES[pipeline.study].keeps_networks:
             for file in (kept.with_name(WORLD_MODEL_FILE), kept):
                 copy_file(file, kept_file(pipeline, networks).parent)
@@ -427,6 +427,8 @@ def evaluate_kept(
     FileNotFoundError if an agent that is asked for by name is not there, or if none is.
     """
     wanted, folder = find_pipelines(study, seeds, only), networks / study
+    if not STUDIES[study].keeps_networks:
+        raise ValueError(f"study {study!r} keeps no agents: its returns are in the tables")
     there = [one for one in wanted if kept_file(one, folder).exists()]
     if not there or (only and len(there) < len(wanted)):
         raise FileNotFoundError(f"{folder} has no agents of these names: {how_to_get(study)}")

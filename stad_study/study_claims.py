@@ -67,13 +67,14 @@ def returns_of_study(study: str, folder: Path = tables.DATA) -> dict[str, np.nda
     wide = table[table["study"] == study].pivot(
         index=["features", "variant", "seed"], columns="track", values="return"
     )
-    if list(wide.columns) != list(planned.tracks) or wide.isna().any(axis=None):
+    arms = [(features, variant) for features in planned.features for variant in planned.variants]
+    complete = {(*arm, seed) for arm in arms for seed in planned.seeds} == set(wide.index)
+    if list(wide.columns) != list(planned.tracks) or wide.isna().any(axis=None) or not complete:
         tracks = f"{planned.tracks[0]} to {planned.tracks[-1]}"
         raise ValueError(f"{study}: expected one episode of each pipeline on the tracks {tracks}")
     return {
         f"{features}: {variant}": wide.loc[features, variant].to_numpy()
-        for features in planned.features
-        for variant in planned.variants
+        for features, variant in arms
     }
 
 

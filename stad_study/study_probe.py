@@ -76,7 +76,7 @@ def probe_study(
                     found = probe_trajectories(*driven, encoder)
                     own = {"variant": variant, "trained": trained, "driver": DRIVERS[driver]}
                     lines += [own | line for line in lines_of(found)]
-        with locked(networks / study, WAIT):
+        with locked(to, WAIT):
             table = pandas.DataFrame(lines).assign(study=study, seed=seed)
             tables.replace_lines("study_probe", table, to)
     return missing

@@ -281,3 +281,8 @@ def test_without_the_kept_agents_an_installed_library_names_the_repository(tmp_p
     monkeypatch.setattr(networks, "NETWORKS", tmp_path / "networks")
     with pytest.raises(FileNotFoundError, match="clone the repository"):
         list(study.evaluate_kept("study1", [0], networks=tmp_path / "networks"))
+
+
+def test_a_study_that_keeps_no_agents_says_so():
+    with pytest.raises(ValueError, match="'study6_fast' keeps no agents"):
+        list(study.evaluate_kept("study6_fast", [0]))
