@@ -102,42 +102,60 @@ def run_evolved(
 
     After an interruption the same call continues. A run that another process does is left to it, so
     several processes may share a folder; each computes on one thread. With `only`, runs that the
-    tables have are run, too, and compared. ValueError as `find_runs`.
+    tables have are run, too, and compared. ValueError as `find_runs`, and for a folder with a
+    recorded run that `only` names.
     """
     root = Path(folder) / study.name
-    for run in find_runs(study, seeds, only, to):
-        if not only and recorded(study, run, to):
-            continue
-        with contextlib.ExitStack() as stack:
-            try:
-                stack.enter_context(locked(root / run.name))
-            except BlockingIOError:
-                continue
-            if not only and recorded(study, run, to):  # another process has just finished it
-                continue
-            print(f"{run.name}: {describe_progress(study, to)}", flush=True)
-            score = run_one(study, run, root, networks)
-            if only and (was := recorded(study, run, to)):
-                print(f"{run.name}: {compare(run, was, root)}", flush=True)
-                continue
-            add_run(study, run, root, to)
-            print(f"{run.name}: mean return {score['mean']:.1f}", flush=True)
+    for run in find_runs(study, seeds, only, to) if only else ():
+        if (root / run.name / SCORE).exists() and recorded(study, run, to):
+            remedy = "give an empty folder with --out to repeat it"
+            raise ValueError(f"{root / run.name} is the recorded run: {remedy}")
+    tried: set[str] = set()
+    # What is found may grow with the tables: a gate decides what follows it.
+    while runs := [run for run in find_runs(study, seeds, only, to) if run.name not in tried]:
+        tried.add(runs[0].name)
+        do_run(study, runs[0], root, to, networks, repeat=bool(only))
     print(describe_progress(study, to))
 
 
-def run_one(study: Evolved, run: Evolution, root: Path, networks: Path = NETWORKS) -> dict:
-    """Do what is missing of a run; returns its score."""
+def do_run(
+    study: Evolved, run: Evolution, root: Path, to: Path, networks: Path, repeat: bool
+) -> None:
+    """Run and add what is not in the tables; with `repeat` run what is there, too, and compare."""
+    if recorded(study, run, to) and not repeat:
+        return
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(root / run.name))
+        except BlockingIOError:
+            return
+        was = recorded(study, run, to)
+        if was and not repeat:  # another process has just finished it
+            return
+        print(f"{run.name}: {describe_progress(study, to)}", flush=True)
+        score = run_one(study, run, root, networks, repeat=was is not None)
+        if was:
+            print(f"{run.name}: {compare(run, was, root)}", flush=True)
+            return
+        add_run(study, run, root, to)
+        print(f"{run.name}: mean return {score['mean']:.1f}", flush=True)
+
+
+def run_one(
+    study: Evolved, run: Evolution, root: Path, networks: Path = NETWORKS, repeat: bool = False
+) -> dict:
+    """Do what is missing of a run; returns its score. A repetition uses no kept log."""
     folder, kept = root / run.name, networks / study.name / run.name
     if (folder / SCORE).exists():
         return load_json(folder / SCORE, kind="score")
-    begin = time.perf_counter()
+    begin, keeps = time.perf_counter(), study.keeps_logs and not repeat
     with fixed_threads():
         sense = study.prepare(run, root, networks)
-        if study.keeps_logs and (kept / LOG).exists() and not (folder / LOG).exists():
+        if keeps and (kept / LOG).exists() and not (folder / LOG).exists():
             copy_file(kept / LOG, folder)
 
         def keep_log(generations: list[dict]) -> None:
-            if study.keeps_logs and "validation" in generations[-1]:
+            if keeps and "validation" in generations[-1]:
                 copy_file(folder / LOG, kept)
 
         evolve(run.config, folder, watch=keep_log, drives=sense)  # type: ignore[arg-type]
@@ -174,7 +192,7 @@ def add_run(study: Evolved, run: Evolution, root: Path, to: Path) -> None:
     returns = {str(t): round(one, 2) for t, one in zip(tracks, score["returns"], strict=True)}
     line = pandas.DataFrame([key | describe_run(run, root)])
     networks = to.parent / NETWORKS.name / study.name
-    with locked(networks, WAIT):
+    with locked(to, WAIT):
         keep_controller(study, run, np.array(score["controller"]), networks)
         tables.replace_lines(f"{study.name}_returns", pandas.DataFrame([key | returns]), to)
         tables.replace_lines(f"{study.name}_runs", line, to)
@@ -191,7 +209,7 @@ def describe_run(run: Evolution, root: Path) -> dict:
             line[f"validation.{entry['generation']}"] = round(entry["validation"]["mean"], 2)
     made = score["made_with"]
     line |= {name: made[name] for name in ("commit", "processor", "numpy", "numba")}
-    line |= {"seconds": round(score["seconds"], 1)}
+    line |= {"seconds": round(score["seconds"], 1)}  # since the last start
     line["frames"] = sum(entry["frames"] for entry in log["generations"])
     line["log"] = checksum((root / run.name / LOG).read_bytes())
     line["controller"] = checksum_of_arrays(parameters=np.array(score["controller"], np.float16))

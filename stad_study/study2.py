@@ -15,21 +15,22 @@ from pathlib import Path
 from typing import NamedTuple
 
 from stad_lab.config import Config
-from stad_lab.io.files import copy_file, locked, save_json
+from stad_lab.io.files import copy_file, load_json, locked, save_json
 from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_mdn_rnn, load_vae
 from stad_lab.training.pipeline import train
 from stad_lab.training.record import RECORD
+from stad_lab.training.trainer import training_device
 from stad_study import tables
 from stad_study.evolved import Evolved
 from stad_study.networks import WORLD_MODEL_FILE, keep_world_model, load_kept_world_model
 from stad_study.senses import Sense
-from stad_study.study import COLLECTING
 
 SEEDS = range(300, 305)
 PASSED = 780.0  # points that each run of the gate must reach
 GATE = {4: SEEDS[:2], 1: SEEDS[:2], 16: SEEDS[:1]}  # episodes of a candidate -> seeds
 CONFIG = Config.preset("paper", processes=1)
-TRAINING = "training.json"  # what the files of V and M say of their training
+LOSSES = "training.json"  # what the files of V and M say of their training
+TRAINING = 6 * 3600.0  # seconds to wait for another process that trains V and M
 
 
 class Run(NamedTuple):
@@ -90,22 +91,32 @@ def prepare(run: Run, root: Path, networks: Path) -> Sense:
     """What C drives with; trains V and M if they are not kept yet."""
     kept = networks / "study2" / f"seed{run.seed}" / run.variant / WORLD_MODEL_FILE
     if not kept.exists():
+        check_device(kept.parents[1])
         train_world(run, root / f"seed{run.seed}", kept)
     return Sense(load_kept_world_model(kept), "z, h")
+
+
+def check_device(seed: Path) -> None:
+    """Raise ValueError if V and M of another variant of the seed are not of this kind of device."""
+    for file in seed.glob(f"*/{RECORD}"):
+        device = load_json(file)["made_with"]["trained_on"].split(",")[0]
+        if device != training_device().type:
+            remedy = "train those of all its variants on one kind of device"
+            raise ValueError(f"V and M of {file.parent} were trained on {device}: {remedy}")
 
 
 def train_world(run: Run, seed: Path, kept: Path) -> None:
     """Train V and M of a seed and variant in the folder `seed`; keep them, record and losses."""
     config, folder = run.config, seed / run.variant
-    with locked(seed, COLLECTING):
+    with locked(seed, TRAINING):
         train(config, folder, seed / "dataset", until="mdn_rnn")
-    keep_world_model(config, folder, kept)
     copy_file(folder / RECORD, kept.parent)
     losses = {
         "vae": load_vae(folder / VAE_FILE)[1],
         "mdn_rnn": load_mdn_rnn(folder / MDN_RNN_FILE)[1],
     }
-    save_json(kept.with_name(TRAINING), losses)
+    save_json(kept.with_name(LOSSES), losses)
+    keep_world_model(config, folder, kept)  # last: a world is complete if it is there
 
 
 STUDY2 = Evolved("study2", parts_of_study2, prepare, keeps_logs=True)

@@ -7,8 +7,9 @@ import pandas
 import pytest
 
 from stad_lab.config import Config
-from stad_lab.io.files import load_json
+from stad_lab.io.files import load_json, save_json
 from stad_lab.training.evolution import LOG
+from stad_lab.training.record import RECORD
 from stad_study import evolved, study2, tables
 from stad_study.evolved import count_runs, find_runs, run_evolved
 from stad_study.study import STUDIES
@@ -76,7 +77,7 @@ def test_a_run_continues_from_the_log_that_is_kept_of_it(tmp_path, monkeypatch, 
     evolved.run_one(STUDY2, run, tmp_path / "stopped", networks)
     kept = networks / "study2" / run.name / LOG
     assert np.shape(load_json(kept)["generations"][1]["returns"]) == (4, 4)  # candidates, episodes
-    losses = load_json(kept.parents[1] / study2.TRAINING)
+    losses = load_json(kept.parents[1] / study2.LOSSES)
     assert {name: one["history"][-1]["step"] for name, one in losses.items()} == {
         "vae": quick(2).vae.steps,
         "mdn_rnn": quick(2).mdn_rnn.steps,
@@ -86,6 +87,30 @@ def test_a_run_continues_from_the_log_that_is_kept_of_it(tmp_path, monkeypatch, 
     run_evolved(STUDY2, tmp_path / "elsewhere", **to)
     assert "evolve C (frame):  50%" in capsys.readouterr().err
     assert count_runs(STUDY2, tmp_path / "data")["gate, 4 each"] == (1, 2)
-    kept.unlink()
-    run_evolved(STUDY2, tmp_path / "whole", **to)
-    assert "bit-identical" in capsys.readouterr().out
+    run_evolved(STUDY2, tmp_path / "whole", **to)  # all of it, although the whole log is kept
+    printed = capsys.readouterr()
+    assert "bit-identical" in printed.out and "evolve C (frame):   0%" in printed.err
+
+
+def test_one_call_goes_on_after_the_gate(tmp_path, monkeypatch):
+    scores = {}
+
+    def do_run(study, run, root, to, networks, repeat):
+        scores[run] = 800.0
+        write_tables(to, scores)
+
+    monkeypatch.setattr(evolved, "do_run", do_run)
+    run_evolved(STUDY2, tmp_path, to=tmp_path)
+    assert (
+        list(scores)[:4] == FOUR + ONE and len(scores) == len(find_runs(STUDY2, to=tmp_path)) == 16
+    )
+
+
+def test_v_and_m_of_a_seed_are_trained_on_one_kind_of_device(tmp_path):
+    record = tmp_path / "study2" / "seed300" / "frame" / RECORD
+    save_json(
+        record,
+        {"kind": "record", "variant": "frame", "made_with": {"trained_on": "cuda, a GPU"}},
+    )
+    with pytest.raises(ValueError, match="seed300/frame were trained on cuda: train those of all"):
+        study2.prepare(Run(300, "input", 4), tmp_path / "runs", tmp_path)

@@ -10,7 +10,7 @@ from stad_lab.agent import Agent, drive
 from stad_lab.config import Config
 from stad_lab.envs.cars import Cars
 from stad_lab.evaluation.trajectories import true_motion
-from stad_lab.io.files import load_json, load_tensors, save_json
+from stad_lab.io.files import load_json, load_tensors
 from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_vae, save_mdn_rnn, save_vae
 from stad_lab.models.controller import parameter_count
 from stad_lab.models.mdn_rnn import MDNRNN
@@ -18,7 +18,7 @@ from stad_lab.models.vae import VAE
 from stad_lab.training.evolution import LOG
 from stad_lab.training.trainer import torch_settings
 from stad_study import senses, tables, world_facts
-from stad_study.evolved import find_runs, run_evolved
+from stad_study.evolved import compare, find_runs, recorded, run_evolved
 from stad_study.networks import WORLD_MODEL_FILE, keep_world_model, load_kept_world_model
 from stad_study.senses import (
     COLUMNS,
@@ -29,7 +29,7 @@ from stad_study.senses import (
     turning,
     whiten,
 )
-from stad_study.study import SCORE, STUDIES
+from stad_study.study import STUDIES
 from stad_study.study5 import STUDY5
 from stad_study.world_facts import WORLD_FILE, load_sense
 
@@ -106,10 +106,11 @@ def test_a_repeated_run_is_compared_with_the_recorded_one(made, networks, tmp_pa
     only = [f"{name}/z_-_motion/1"]
     run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
     assert "bit-identical" in capsys.readouterr().out
-    score = load_json(tmp_path / "study5" / only[0] / SCORE)
-    save_json(tmp_path / "study5" / only[0] / SCORE, score | {"returns": score["returns"][::-1]})
-    run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
-    assert "differs in returns" in capsys.readouterr().out
+    with pytest.raises(ValueError, match="is the recorded run: give an empty folder"):
+        run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
+    (run,) = find_runs(STUDY5, only=only)
+    was = recorded(STUDY5, run, made / "data") | {"returns": "other"}
+    assert compare(run, was, tmp_path / "study5").startswith("differs in returns: mean ")
 
 
 def test_c_that_sees_z_alone_drives_as_the_agent_does(made, networks):
