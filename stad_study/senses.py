@@ -77,8 +77,8 @@ def random_directions(white: Whitening, variance: float, rng: np.random.Generato
 
     They are drawn from a normal distribution whose covariance is a power of that of z: with power 0
     all directions are alike, with a larger one those of much variance are likelier. The power is
-    the least of 0, 1/2, 1 ... 4 whose draws exceed the variance at least once in ten; then the
-    draw nearest to the variance is taken.
+    the least of 0, 1, 2 ... 8 whose draws exceed the variance at least once in ten; then the draw
+    nearest to the variance is taken.
     """
     size = len(white.mean)
     for power in range(9):

@@ -89,6 +89,8 @@ def compare_family(scores: dict[str, np.ndarray], comparisons: dict, tested: boo
             sum(weight * scores[arm] for arm, weight in side.items()) for side in sides
         )
         found[name] = compare(subtracted, added)
+        if not tested:
+            del found[name]["p"]
     if tested:
         adjusted = statistics.holm([one["p"] for one in found.values()])
         for one, p in zip(found.values(), adjusted, strict=True):
