@@ -152,6 +152,7 @@ def run_one(
     with fixed_threads():
         sense = study.prepare(run, root, networks)
         if keeps and (kept / LOG).exists() and not (folder / LOG).exists():
+            print(f"{run.name}: goes on from {kept / LOG}", flush=True)
             copy_file(kept / LOG, folder)
 
         def keep_log(generations: list[dict]) -> None:

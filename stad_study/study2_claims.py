@@ -16,7 +16,11 @@ from stad_study.study_claims import compare
 
 
 def describe_study2(folder: Path = tables.DATA) -> dict:
-    """Progress by part, "gate": episodes -> scores and whether it passed, and "comparison"."""
+    """Progress by part, "gate": episodes -> scores and whether it passed.
+
+    After the last run "scores" has those of each arm by seed, and "comparison" the test, if there
+    are pairs enough.
+    """
     counts = count_runs(STUDY2, folder)
     gates = {episodes: has_passed(episodes, folder) for episodes in GATE}
     found: dict[str, Any] = {
@@ -29,8 +33,14 @@ def describe_study2(folder: Path = tables.DATA) -> dict:
         },
     }
     after = counts.get("after the gate")
-    passed = [episodes for episodes in (1, 4) if gates[episodes]]
-    if passed and after and after[0] == after[1]:
+    if not after or after[0] < after[1]:
+        return found
+    runs = tables.read("study2_runs", folder).sort_values("seed")
+    found["scores"] = {
+        f"{variant}, {episodes} each": own["mean"].tolist()
+        for (variant, episodes), own in runs.groupby(["variant", "episodes"])
+    }
+    if passed := [episodes for episodes in (1, 4) if gates[episodes]]:
         pair = [returns_of(variant, passed[0], folder) for variant in ("frame", "input_output")]
         found["comparison"] = compare(*pair) | {"episodes": passed[0]}
     return found

@@ -57,10 +57,13 @@ def test_the_comparison_waits_for_the_last_run(tmp_path):
     write_tables(tmp_path, dict(list(scores.items())[:-1]))
     found = describe_study2(tmp_path)
     assert found["gate"]["4"]["passed"] and not found["gate"]["1"]["passed"]
-    assert "comparison" not in found
+    assert "comparison" not in found and "scores" not in found
     write_tables(tmp_path, scores)
-    found = describe_study2(tmp_path)["comparison"]
-    assert found["difference"] == pytest.approx(40, abs=2) and found["episodes"] == 4
+    found = describe_study2(tmp_path)
+    assert found["comparison"]["difference"] == pytest.approx(40, abs=2)
+    assert found["comparison"]["episodes"] == 4
+    assert found["scores"]["input_output, 4 each"] == [840.0] * 5
+    assert found["scores"]["frame, 1 each"] == [700.0] * 2
 
 
 def quick(generations):
@@ -85,7 +88,8 @@ def test_a_run_continues_from_the_log_that_is_kept_of_it(tmp_path, monkeypatch, 
     monkeypatch.setattr(study2, "CONFIG", quick(4))
     to = {"only": [run.name], "to": tmp_path / "data", "networks": networks}
     run_evolved(STUDY2, tmp_path / "elsewhere", **to)
-    assert "evolve C (frame):  50%" in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert "evolve C (frame):  50%" in printed.err and f"goes on from {kept}" in printed.out
     assert count_runs(STUDY2, tmp_path / "data")["gate, 4 each"] == (1, 2)
     run_evolved(STUDY2, tmp_path / "whole", **to)  # all of it, although the whole log is kept
     printed = capsys.readouterr()
