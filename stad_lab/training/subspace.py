@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 from tqdm.auto import tqdm
 
 from stad_lab.config import Config
@@ -72,6 +73,9 @@ def load_start(path: Path, world_model: WorldModel) -> np.ndarray:
     return parameters
 
 
+# Threads of BLAS that wait for the next product hold the cores that PyTorch's need: this takes
+# a third of the time.
+@threadpool_limits.wrap(limits=1, user_api="blas")
 def find_components(config: Config, dataset: Callable[[], Dataset], folder: Path) -> bool:
     """Fit the principal components of what C sees in the dataset; writes COMPONENTS_FILE.
 

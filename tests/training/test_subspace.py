@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from stad_lab.config import Config
 from stad_lab.evaluation.verify import verify
@@ -15,6 +16,7 @@ from stad_lab.io.weights import WorldModel, load_controller, load_world_model
 from stad_lab.models.controller import control, seen_columns
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
+from stad_lab.training import subspace
 from stad_lab.training.dataset import Dataset, collect
 from stad_lab.training.evolution import LOG, averaged_mean, evolve, replay
 from stad_lab.training.pipeline import train
@@ -128,6 +130,23 @@ def test_components_are_fitted_once_and_belong_to_their_v_and_m(
         search_space(CONFIG, load_world_model(other), other)
     assert find_components(CONFIG, dataset, other)
     assert (other / COMPONENTS_FILE).read_bytes() == (searched / COMPONENTS_FILE).read_bytes()
+
+
+def test_components_are_fitted_on_one_thread_of_blas_whatever_the_machine_has(
+    searched, dataset, tmp_path, monkeypatch
+):
+    threads = []
+
+    def note(*arguments):
+        threads.extend(one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas")
+        return principal_components(*arguments)
+
+    monkeypatch.setattr(subspace, "principal_components", note)
+    folder = shutil.copytree(searched, tmp_path / "run")
+    (folder / COMPONENTS_FILE).unlink()
+    with threadpool_limits(2, user_api="blas"):
+        assert find_components(CONFIG, dataset, folder)
+    assert threads and set(threads) == {1}
 
 
 def test_a_file_with_the_name_of_another_kind_is_refused(searched, tmp_path):
