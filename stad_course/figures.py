@@ -7,11 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.viz.plots import (
     BLUE,
     COLORS,
-    MARKERS,
     ORANGE,
     RED,
     SKY,
@@ -172,29 +170,3 @@ def plot_ranks(ranks: dict[str, np.ndarray], title: str) -> Figure:
     legend_below(figure, axis)
     places = [f"{name} rank {own[winner]}" for name, own in ranks.items()]
     return describe(figure, title, "The winner of the first: ", places)
-
-
-def plot_episodes(
-    runs: dict[str, list[tuple[np.ndarray, np.ndarray]]],
-    published: dict[str, dict[int, float]],
-    title: str,
-) -> Figure:
-    """Sample efficiency: score against the episodes driven for it, on a logarithmic axis.
-
-    Args:
-        runs: name -> for every seed its episodes and its scores at those.
-        published: name -> episodes -> score, as others have reported: points without a line.
-    """
-    figure, ((axis,),) = new_figure(8.0, 4.2 + 0.08 * len(runs))
-    last = []
-    for (name, seeds), (color, dash) in zip(runs.items(), cycle(STYLES), strict=False):
-        for episodes, scores in seeds:
-            (line,) = axis.plot(episodes, scores, dash, color=color, lw=1.3, alpha=0.8)
-        line.set_label(name)
-        last.append(f"{name} {np.mean([scores[-1] for _, scores in seeds]):.0f}")
-    for (name, points), marker in zip(published.items(), MARKERS, strict=False):
-        axis.plot(list(points), list(points.values()), marker, color="black", ms=6, label=name)
-    axis.axhline(SOLVED, **THIN)
-    axis.set(xscale="log", xlabel="episodes (logarithmic)", ylabel="score", ylim=(None, 960))
-    legend_below(figure, axis)  # inside the axis, many names would hide the points
-    return describe(figure, title, "At the end, mean of the seeds: ", last)

@@ -27,7 +27,6 @@ from stad_study.experiments import BASELINE_DRIVERS, EXPERIMENTS
 CLAIMS = tables.DATA / "claims.json"
 PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # on CarRacing-v0
 PAPER_BEST_AGENT = 929.82  # the highest point of its figures
-WORLD_MODELS = {25600: 823.0, 51200: 867.0, 204800: 880.0, 1843200: 900.5}  # episodes -> score
 
 
 def compute_claims() -> dict[str, dict]:
@@ -80,20 +79,6 @@ def describe_agents() -> dict:
             **total_budget(record),
         }
     return found
-
-
-def learning_curve(
-    runs: pandas.DataFrame, generations: pandas.DataFrame, experiment: str, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """All episodes driven so far, and score, at each validation of a run: arrays (validations,)."""
-    named = f"experiment == {experiment!r} and role == 'run' and seed == {seed}"
-    run, log = runs.query(named).iloc[0], generations.query(named)
-    settings = run.filter(like="config.evolution.").rename(lambda name: name.split(".")[-1])
-    own = run["budget.evolution.episodes"] + run["budget.validation.episodes"]
-    validated = log["validation.mean"].notna()
-    driven = run["total.episodes"] - own + log["generation"] * settings.population * settings.tracks
-    driven += validated.cumsum() * settings.validation_tracks
-    return driven[validated].to_numpy(np.int64), log["validation.mean"][validated].to_numpy()
 
 
 def write_claims(path: Path = CLAIMS) -> Path:

@@ -3,9 +3,8 @@
 import json
 
 import numpy as np
-import pandas
 
-from stad_lab.config import VARIANTS, flatten
+from stad_lab.config import VARIANTS
 from stad_study import claims, measurements
 
 
@@ -31,13 +30,6 @@ def test_the_findings_of_the_pages_hold():
     assert agents["frame"]["failed"] == 0 and agents["cropped_input"]["mean"] < 900
 
 
-def test_lost_points_add_up_and_a_learning_curve_counts_every_episode():
+def test_lost_points_add_up():
     lost = measurements.lost_points(np.array([950.0, 700.0]), np.array([500, 1000]))
     assert lost == {"speed": 50, "waiting": 25, "tiles": 100}
-    run = {"experiment": "a", "role": "run", "seed": 0}
-    evolution = {"population": 4, "tracks": 2, "validation_tracks": 3}
-    spent = {"total.episodes": 119, "budget.evolution.episodes": 16}
-    spent["budget.validation.episodes"] = 3
-    runs = pandas.DataFrame([run | spent | flatten(evolution, "config.evolution.")])
-    log = pandas.DataFrame({"generation": [1, 2], "validation.mean": [np.nan, 7.0]}).assign(**run)
-    assert [part.tolist() for part in claims.learning_curve(runs, log, "a", 0)] == [[119], [7]]

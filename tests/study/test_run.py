@@ -17,7 +17,6 @@ from stad_lab.training.record import RECORD, total_budget
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE
 from stad_study import run as replication
 from stad_study import tables
-from stad_study.claims import learning_curve
 from stad_study.cli import main
 from stad_study.experiments import BASELINE_DRIVERS, EXPERIMENTS, Experiment
 from stad_study.run import EVALUATION, describe_time, keep, replicate
@@ -202,15 +201,13 @@ def test_finished_seeds_are_kept_in_the_tables(made, copy, tmp_path):
 
 def test_the_budget_of_a_run_counts_every_episode_that_was_driven_for_it(made, tmp_path):
     keep("two", made[0], to=tmp_path)
-    runs, generations = (tables.read(name, tmp_path) for name in ("runs", "generations"))
+    runs = tables.read("runs", tmp_path)
     # 8 random episodes, 2 generations of 4 agents, 2 validation tracks; then 2 episodes of the
     # agent, 4 generations and 2 validations.
     total = 8 + 8 + 2 + 2 + 16 + 4
     own = runs[runs.role == "run"]
     assert own["total.episodes"].tolist() == [total] * 2
     assert own["total.agents"].tolist() == [8 + 16] * 2
-    episodes, scores = learning_curve(runs, generations, "two", 1)
-    assert episodes.tolist() == [total - 8 - 2, total] and len(scores) == 2
 
 
 def test_a_baseline_driver_is_an_experiment_like_any_other(tmp_path, monkeypatch):
