@@ -53,7 +53,6 @@ from stad_lab.training.vae import vae_training
 from stad_study.parity import AREAS, compare_pictures
 
 SOURCE = "input"  # the shipped agent that drives, and the variant that is trained
-WHOLE_RUNS = "fast", "laptop"  # presets; the agent of the last one drives with Gymnasium, too
 GYMNASIUM, ENVPOOL = "Gymnasium", "EnvPool"
 CARS = 16  # in a batch
 V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, the first of them not timed
@@ -312,13 +311,13 @@ def training_speed(training: Training, items: int) -> float:
 def measure_run(rounds: int) -> dict:
     """A whole run of each preset, with the evaluation of its agent on 100 tracks."""
     return {
-        f"minutes of a whole run, {preset}": time_run(preset, gymnasium=preset == WHOLE_RUNS[-1])
-        for preset in WHOLE_RUNS
+        "minutes of a whole run": time_run("laptop", ["our engine", GYMNASIUM]),
+        "minutes of a whole run, fast": time_run("fast", ["our engine"]),
     }
 
 
-def time_run(preset: str, gymnasium: bool) -> dict[str, float]:
-    """Minutes of each stage of one run, evaluated with our engine and, if asked, Gymnasium."""
+def time_run(preset: str, renderers: list[str]) -> dict[str, float]:
+    """Minutes of each stage of one run, and of the evaluations with some renderers."""
     config = Config.preset(preset, variant=SOURCE)
     with tempfile.TemporaryDirectory() as folder:
         begin = time.perf_counter()
@@ -326,9 +325,9 @@ def time_run(preset: str, gymnasium: bool) -> dict[str, float]:
         seconds = load_json(Path(folder) / RECORD)["seconds"]
         seconds = {stage: seconds[stage] for stage in STAGES}
         seconds["all else"] = time.perf_counter() - begin - sum(seconds.values())
-        for fast, name in ((True, "our engine"), (False, GYMNASIUM))[: 1 + gymnasium]:
+        for name in renderers:
             begin = time.perf_counter()
-            evaluate(folder, fast=fast, processes=config.processes)
+            evaluate(folder, fast=name != GYMNASIUM, processes=config.processes)
             seconds[f"evaluation with {name}"] = time.perf_counter() - begin
     return {name: own / 60 for name, own in seconds.items()}
 

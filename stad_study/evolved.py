@@ -38,7 +38,7 @@ from stad_study.study import CARS, SCORE, STUDIES, WAIT, Run, fixed_threads, sel
 CHECKSUMS = ("log", "controller", "returns")
 
 
-class Evolution(Run, Protocol):
+class EvolvedRun(Run, Protocol):
     """One C: a NamedTuple of a seed and what the study varies."""
 
     @property
@@ -119,7 +119,7 @@ def run_evolved(
 
 
 def do_run(
-    study: Evolved, run: Evolution, root: Path, to: Path, networks: Path, repeat: bool
+    study: Evolved, run: EvolvedRun, root: Path, to: Path, networks: Path, repeat: bool
 ) -> None:
     """Run and add what is not in the tables; with `repeat` run what is there, too, and compare."""
     if recorded(study, run, to) and not repeat:
@@ -142,7 +142,7 @@ def do_run(
 
 
 def run_one(
-    study: Evolved, run: Evolution, root: Path, networks: Path = NETWORKS, repeat: bool = False
+    study: Evolved, run: EvolvedRun, root: Path, networks: Path = NETWORKS, repeat: bool = False
 ) -> dict:
     """Do what is missing of a run; returns its score. A repetition uses no kept log."""
     folder, kept = root / run.name, networks / study.name / run.name
@@ -186,7 +186,7 @@ def score_controller(sense: Sense, controller: np.ndarray) -> dict:
     }
 
 
-def add_run(study: Evolved, run: Evolution, root: Path, to: Path) -> None:
+def add_run(study: Evolved, run: EvolvedRun, root: Path, to: Path) -> None:
     """Add a finished run to the tables: its line of runs, and its returns rounded to cents."""
     score, key = load_json(root / run.name / SCORE, kind="score"), run._asdict()
     tracks = STUDIES["study1"].tracks
@@ -199,7 +199,7 @@ def add_run(study: Evolved, run: Evolution, root: Path, to: Path) -> None:
         tables.replace_lines(f"{study.name}_runs", line, to)
 
 
-def describe_run(run: Evolution, root: Path) -> dict:
+def describe_run(run: EvolvedRun, root: Path) -> dict:
     """The line of runs: score, learning curve, machine, seconds and checksums."""
     score = load_json(root / run.name / SCORE, kind="score")
     log = load_json(root / run.name / LOG)
@@ -217,7 +217,7 @@ def describe_run(run: Evolution, root: Path) -> dict:
     return line | {"returns": checksum_of_arrays(returns=returns)}
 
 
-def keep_controller(study: Evolved, run: Evolution, controller: np.ndarray, folder: Path) -> None:
+def keep_controller(study: Evolved, run: EvolvedRun, controller: np.ndarray, folder: Path) -> None:
     """Add a C to the file of its seed: float16 (parameters,) under the name of the run."""
     path = folder / f"seed{run.seed}.safetensors"
     tensors = load_tensors(path)[0] if path.exists() else {}
@@ -225,14 +225,14 @@ def keep_controller(study: Evolved, run: Evolution, controller: np.ndarray, fold
     save_tensors(path, dict(sorted(tensors.items())), kind="controllers", study=study.name)
 
 
-def recorded(study: Evolved, run: Evolution, to: Path = tables.DATA) -> dict | None:
+def recorded(study: Evolved, run: EvolvedRun, to: Path = tables.DATA) -> dict | None:
     """The line of a run in the table of runs; None if it is not there."""
     table = tables.read_or_empty(f"{study.name}_runs", to)
     own = table[(table[study.key] == list(run._asdict().values())).all(axis=1)]
     return own.iloc[0].to_dict() if len(own) else None
 
 
-def compare(run: Evolution, was: dict, root: Path) -> str:
+def compare(run: EvolvedRun, was: dict, root: Path) -> str:
     """Whether a run that was repeated is, bit by bit, the one in the tables."""
     now = describe_run(run, root)
     differs = [name for name in CHECKSUMS if was[name] != now[name]]

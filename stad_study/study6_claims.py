@@ -6,8 +6,8 @@ It is computed once all pairs are in the tables.
 from pathlib import Path
 
 import numpy as np
-from scipy import stats
 
+from stad_lab.evaluation.statistics import mean_interval
 from stad_study import tables
 from stad_study.study import STUDIES
 from stad_study.study_claims import MARGIN, describe_progress, returns_of_study
@@ -29,7 +29,7 @@ def describe_study6(folder: Path = tables.DATA) -> dict:
         return found
     scores = {name: scores_of(name, folder) for name in RECIPES}
     differences = scores["study6_fast"] - scores["study6_laptop"]
-    bound = lower_bound(differences)
+    bound, _ = mean_interval(differences, outside=0.1)  # one-sided: 5% lie below
     return found | {
         "scores": {name: own.tolist() for name, own in scores.items()},
         "difference": float(differences.mean()),
@@ -42,10 +42,3 @@ def scores_of(study: str, folder: Path) -> np.ndarray:
     """The mean return of each pipeline, variant by variant, float64 (pairs,)."""
     arms = returns_of_study(study, folder)
     return np.concatenate([returns.mean(axis=1) for returns in arms.values()])
-
-
-def lower_bound(differences: np.ndarray) -> float:
-    """The lower end of the one-sided 95% interval of the mean, by Student's t."""
-    return float(
-        differences.mean() + stats.t.ppf(0.05, len(differences) - 1) * stats.sem(differences)
-    )

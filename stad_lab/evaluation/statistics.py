@@ -51,12 +51,11 @@ def paired_p(differences: Sequence[float] | np.ndarray) -> float:
     return float(stats.ttest_1samp(differences, 0.0).pvalue)
 
 
-def mean_interval(values: Sequence[float]) -> list[float]:
-    """95% interval of the mean of at least two values, by Student's t."""
+def mean_interval(values: Sequence[float] | np.ndarray, outside: float = 0.05) -> list[float]:
+    """Student's interval of the mean of two values or more; half of `outside` on each side."""
     error = stats.sem(values)
-    return [
-        float(np.mean(values) + t * error) for t in stats.t.ppf([0.025, 0.975], len(values) - 1)
-    ]
+    ends = stats.t.ppf([outside / 2, 1 - outside / 2], len(values) - 1)
+    return [float(np.mean(values) + t * error) for t in ends]
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
