@@ -1,8 +1,9 @@
 """The configuration of a run: one frozen dataclass for each stage, and four presets.
 
 `Config.preset("laptop")` is the default; `quick` shows in a minute that everything works, `fast`
-trains V and M on less than `laptop` does, and `paper` is the budget that the paper states. A run's configuration is written into its folder. Each stage
-depends on its own part alone: another step size of CMA-ES leaves a trained V valid.
+trains V and M on less than `laptop` does, and `paper` is the budget that the paper states. A run's
+configuration is written into its folder. Each stage depends on its own part alone: another step
+size of CMA-ES leaves a trained V valid.
 
 The docstring below each field is its help on the command line. A field that is added later needs a
 default that means what the code did before, so that older runs stay valid.
