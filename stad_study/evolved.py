@@ -33,7 +33,16 @@ from stad_lab.training.record import provenance
 from stad_study import tables
 from stad_study.networks import NETWORKS
 from stad_study.senses import Sense
-from stad_study.study import CARS, SCORE, STUDIES, WAIT, Run, fixed_threads, select
+from stad_study.study import (
+    CARS,
+    SCORE,
+    STUDIES,
+    WAIT,
+    Run,
+    fixed_threads,
+    refuse_finished,
+    select,
+)
 
 CHECKSUMS = ("log", "controller", "returns")
 
@@ -84,6 +93,15 @@ def count_runs(study: Evolved, to: Path = tables.DATA) -> dict[str, tuple[int, i
     }
 
 
+def describe_counts(study: Evolved, to: Path = tables.DATA) -> dict[str, dict[str, int]]:
+    """Claims on progress: "runs" that are done and "planned" ones, each by part."""
+    counts = count_runs(study, to)
+    return {
+        name: {part: both[index] for part, both in counts.items()}
+        for index, name in enumerate(("runs", "planned"))
+    }
+
+
 def describe_progress(study: Evolved, to: Path = tables.DATA) -> str:
     """How many runs of each part are in the tables."""
     told = [f"{part} {done} of {count}" for part, (done, count) in count_runs(study, to).items()]
@@ -107,9 +125,8 @@ def run_evolved(
     """
     root = Path(folder) / study.name
     for run in find_runs(study, seeds, only, to) if only else ():
-        if (root / run.name / SCORE).exists() and recorded(study, run, to):
-            remedy = "give an empty folder with --out to repeat it"
-            raise ValueError(f"{root / run.name} is the recorded run: {remedy}")
+        if recorded(study, run, to):
+            refuse_finished(root / run.name)
     tried: set[str] = set()
     # What is found may grow with the tables: a gate decides what follows it.
     while runs := [run for run in find_runs(study, seeds, only, to) if run.name not in tried]:

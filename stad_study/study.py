@@ -173,9 +173,8 @@ def run_study(
     """
     wanted, root = find_pipelines(study, seeds, only), Path(folder) / study
     for pipeline in wanted if only else ():
-        if (root / pipeline.name / SCORE).exists() and recorded(pipeline, to):
-            remedy = "give an empty folder with --out to repeat it"
-            raise ValueError(f"{root / pipeline.name} is the recorded pipeline: {remedy}")
+        if recorded(pipeline, to):
+            refuse_finished(root / pipeline.name)
     for seed, variant in dict.fromkeys((one.seed, one.variant) for one in wanted):
         own = [one for one in wanted if (one.seed, one.variant) == (seed, variant)]
         if not only and not unfinished(own, to):
@@ -197,6 +196,13 @@ def run_study(
                     found = describe_score(pipeline, root)
                 print(f"{pipeline.name}: {found}", flush=True)
     print(f"{study}: {describe_progress(study, wanted, to)}")
+
+
+def refuse_finished(folder: Path) -> None:
+    """ValueError if a run that is to be repeated is finished in this folder."""
+    if (folder / SCORE).exists():
+        remedy = "give an empty folder with --out to repeat it"
+        raise ValueError(f"{folder} has the recorded run: {remedy}")
 
 
 def unfinished(pipelines: list[Pipeline], to: Path) -> list[Pipeline]:

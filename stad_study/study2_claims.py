@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stad_study import tables
-from stad_study.evolved import count_runs
+from stad_study.evolved import describe_counts
 from stad_study.study2 import GATE, SEEDS, STUDY2, has_passed
 from stad_study.study_claims import compare
 
@@ -21,19 +21,18 @@ def describe_study2(folder: Path = tables.DATA) -> dict:
     After the last run "scores" has those of each arm by seed, and "comparison" the test, if there
     are pairs enough.
     """
-    counts = count_runs(STUDY2, folder)
+    counts = describe_counts(STUDY2, folder)
     gates = {episodes: has_passed(episodes, folder) for episodes in GATE}
     found: dict[str, Any] = {
-        "runs": {part: done for part, (done, _) in counts.items()},
-        "planned": {part: planned for part, (_, planned) in counts.items()},
+        **counts,
         "gate": {
             str(episodes): {"scores": scores_of("frame", episodes, folder), "passed": passed}
             for episodes, passed in gates.items()
             if passed is not None
         },
     }
-    after = counts.get("after the gate")
-    if not after or after[0] < after[1]:
+    part = "after the gate"
+    if part not in counts["runs"] or counts["runs"][part] < counts["planned"][part]:
         return found
     runs = tables.read("study2_runs", folder).sort_values("seed")
     found["scores"] = {

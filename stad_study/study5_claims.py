@@ -8,13 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 
 from stad_lab.evaluation import statistics
 from stad_study import tables
-from stad_study.evolved import count_runs
+from stad_study.evolved import describe_counts
 from stad_study.study import STUDIES
 from stad_study.study5 import ARMS, REPEATS, STUDY5
-from stad_study.study_claims import compare, find_verdict
+from stad_study.study_claims import compare, find_verdict, mean_curve
 
 Families = dict[tuple[str, ...], dict[str, tuple[dict[str, float], ...]]]
 
@@ -47,15 +48,12 @@ def describe_study5(folder: Path = tables.DATA) -> dict:
 
     An arm is named by variant and what C sees: "frame: z + motion".
     """
-    counts = count_runs(STUDY5, folder)
-    found: dict[str, Any] = {
-        "runs": {part: done for part, (done, _) in counts.items()},
-        "planned": {part: planned for part, (_, planned) in counts.items()},
-    }
-    complete = [part for part, (done, planned) in counts.items() if done == planned]
-    scores = scores_of(complete, folder)
-    found["arms"] = {arm: describe_arm(own) for arm, own in scores.items()}
-    found["comparisons"] = {}
+    counts = describe_counts(STUDY5, folder)
+    planned = counts["planned"].items()
+    complete = [part for part, runs in planned if counts["runs"][part] == runs]
+    scores, curves = scores_of(complete, folder), curves_of(complete, folder)
+    arms = {arm: describe_arm(scores[arm], curves[arm]) for arm in scores}
+    found: dict[str, Any] = {**counts, "arms": arms, "comparisons": {}}
     for families, tested in ((FAMILIES, True), (DESCRIBED, False)):
         for parts, comparisons in families.items():
             if set(parts) <= set(complete):
@@ -65,10 +63,19 @@ def describe_study5(folder: Path = tables.DATA) -> dict:
 
 def scores_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndarray]:
     """Arm -> returns (seeds, tracks), averaged over the runs of each seed."""
-    if not parts:
-        return {}
-    table = tables.read("study5_returns", folder).set_index(tables.SENSED)
-    table, found = table[[column for column in table if column.isdigit()]], {}
+    table = tables.read_or_empty("study5_returns", folder).set_index(tables.SENSED)
+    return by_arm(table[[column for column in table if column.isdigit()]], parts)
+
+
+def curves_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndarray]:
+    """Arm -> validation means (seeds, validations), averaged over the runs of each seed."""
+    table = tables.read_or_empty("study5_runs", folder).set_index(tables.SENSED)
+    return by_arm(table.filter(like="validation."), parts)
+
+
+def by_arm(table: pandas.DataFrame, parts: list[str]) -> dict[str, np.ndarray]:
+    """Arm -> lines of a table of runs (seeds, columns), averaged over the runs of each seed."""
+    found = {}
     for variant, sees in (arm for part in parts for arm in ARMS[part]):
         seeds = STUDIES["study1"].seeds
         runs = [[table.loc[(seed, variant, sees, n)] for n in REPEATS] for seed in seeds]
@@ -76,9 +83,10 @@ def scores_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndar
     return found
 
 
-def describe_arm(returns: np.ndarray) -> dict:
-    """The score of an arm, and of each seed, from returns (seeds, tracks)."""
-    return {"mean": float(returns.mean()), "by_seed": returns.mean(axis=1).tolist()}
+def describe_arm(returns: np.ndarray, curves: np.ndarray) -> dict:
+    """Score of an arm and of each seed, and its learning curve; each from (seeds, ...)."""
+    score = {"mean": float(returns.mean()), "by_seed": returns.mean(axis=1).tolist()}
+    return score | {"curve": mean_curve(curves)}
 
 
 def compare_family(scores: dict[str, np.ndarray], comparisons: dict, tested: bool) -> dict:

@@ -38,7 +38,7 @@ def describe_study1(folder: Path = tables.DATA, study: str = "study1") -> dict:
     for variants in FAMILIES.values():
         comparisons |= compare_family(returns, areas, variants)
     arms = {arm: describe_arm(own, areas[arm]) for arm, own in returns.items()}
-    bands = {arm: mean_curve(*curve) for arm, curve in curves.items()}
+    bands = {arm: over_episodes(*curve) for arm, curve in curves.items()}
     afterwards = compare_afterwards(returns)
     found |= {"arms": arms, "comparisons": comparisons, "afterwards": afterwards}
     return found | {"curves": bands, "curve_differences": curve_differences(curves)}
@@ -181,21 +181,25 @@ def area_under(episodes: np.ndarray, scores: np.ndarray) -> np.ndarray:
     return np.trapezoid(scores, episodes, axis=1) / np.ptp(episodes, axis=1)
 
 
-def mean_curve(episodes: np.ndarray, scores: np.ndarray) -> dict[str, list[float]]:
-    """The mean over seeds and its 95% interval at each validation, with the mean of episodes."""
+def mean_curve(scores: np.ndarray) -> dict[str, list[float]]:
+    """The mean over seeds at each validation, and its 95% interval, from (seeds, validations)."""
     low, high = np.array([statistics.mean_interval(own) for own in scores.T]).T
-    found = {"episodes": episodes.mean(axis=0), "mean": scores.mean(axis=0)}
-    found |= {"low": low, "high": high}
+    found = {"mean": scores.mean(axis=0), "low": low, "high": high}
     return {name: np.round(values, 1).tolist() for name, values in found.items()}
 
 
+def over_episodes(episodes: np.ndarray, scores: np.ndarray) -> dict[str, list[float]]:
+    """The mean curve, with the mean of the episodes driven so far: both (seeds, validations)."""
+    return {"episodes": np.round(episodes.mean(axis=0), 1).tolist()} | mean_curve(scores)
+
+
 def curve_differences(curves: dict[str, tuple]) -> dict[str, dict[str, list[float]]]:
-    """Learning curves less that of `frame` of the same seed: as `mean_curve`, for each arm."""
+    """Learning curves less that of `frame` of the same seed: as `over_episodes`, by arm."""
     found = {}
     for arm, (episodes, scores) in curves.items():
         baseline = curves[f"{arm.partition(': ')[0]}: frame"][1]
         if not arm.endswith(": frame"):
-            found[arm] = mean_curve(episodes, scores - baseline)
+            found[arm] = over_episodes(episodes, scores - baseline)
     return found
 
 

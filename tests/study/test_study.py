@@ -183,7 +183,7 @@ def test_a_pipeline_repeated_by_name_is_bit_identical(made, tmp_path, capsys, mo
     told = capsys.readouterr().out
     assert "seed0/input_output/z: bit-identical to the recorded one, all 18 returns" in told
     assert main(command) == 2  # it would compare the folder's own files
-    assert "is the recorded pipeline: give an empty folder with --out" in capsys.readouterr().err
+    assert "has the recorded run: give an empty folder with --out" in capsys.readouterr().err
     other = tables.read_study("episodes", made / "data")
     other["return"] += 0.1
     shutil.copytree(made / "data", tmp_path / "data")

@@ -106,7 +106,7 @@ def test_a_repeated_run_is_compared_with_the_recorded_one(made, networks, tmp_pa
     only = [f"{name}/z_-_motion/1"]
     run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
     assert "bit-identical" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="is the recorded run: give an empty folder"):
+    with pytest.raises(ValueError, match="has the recorded run: give an empty folder"):
         run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
     (run,) = find_runs(STUDY5, only=only)
     was = recorded(STUDY5, run, made / "data") | {"returns": "other"}

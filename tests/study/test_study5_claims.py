@@ -19,7 +19,8 @@ def write_tables(folder, runs):
         mean = 800 + EFFECTS.get(run.sees, 0) + 20 * (run.variant == "input_output")
         returns = mean + rng.normal(0, 5) + rng.normal(0, 20, 40)
         columns = {str(1000 + track): one for track, one in enumerate(returns)}
-        lines.append((run._asdict(), columns | {"mean": returns.mean()}))
+        curve = {"validation.5": mean - 100 - run.repeat, "validation.10": mean}
+        lines.append((run._asdict(), columns | curve | {"mean": returns.mean()}))
     made = {"processor": "a CPU", "controller": "c"}
     for name in ("runs", "returns"):
         table = pandas.DataFrame([key | found | made for key, found in lines])
@@ -33,6 +34,13 @@ def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
     assert found["runs"] == {"5a": 216, "5b": 72, "5c": 143}
     assert set(found["comparisons"]) == {"interaction", "input_output less input"}
     assert "frame: z + motion" not in found["arms"] and "frame: z" in found["arms"]
+
+
+def test_the_learning_curve_of_an_arm_is_averaged_over_its_runs(tmp_path):
+    write_tables(tmp_path, find_runs(STUDY5))
+    arms = describe_study5(tmp_path)["arms"]
+    assert arms["frame: z + motion"]["curve"]["mean"] == [738, 840]
+    assert arms["input_output: z"]["curve"]["low"] == [718, 820]
 
 
 def test_effects_are_found_and_corrected_within_their_family(tmp_path):
