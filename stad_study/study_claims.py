@@ -39,8 +39,9 @@ def describe_study1(folder: Path = tables.DATA, study: str = "study1") -> dict:
         comparisons |= compare_family(returns, areas, variants)
     arms = {arm: describe_arm(own, areas[arm]) for arm, own in returns.items()}
     bands = {arm: over_episodes(*curve) for arm, curve in curves.items()}
-    afterwards = compare_afterwards(returns)
-    found |= {"arms": arms, "comparisons": comparisons, "afterwards": afterwards}
+    found |= {"arms": arms, "comparisons": comparisons}
+    found |= {"afterwards": compare_afterwards(returns)}
+    found |= {"verdicts_without_a_seed": leave_one_out(returns)}
     return found | {"curves": bands, "curve_differences": curve_differences(curves)}
 
 
@@ -129,6 +130,21 @@ def compare_afterwards(returns: dict[str, np.ndarray]) -> dict[str, dict]:
         for variant in ("input", "input_output")
     )
     return found | {"input_output less input": compare(*both)}
+
+
+def leave_one_out(returns: dict[str, np.ndarray]) -> dict[str, list[str]]:
+    """Features -> the primary verdicts that all seeds but one would give, for each seed left out.
+
+    The protocol does not have it: it shows how much a verdict depends on single seeds.
+    """
+    found: dict[str, list[str]] = {features: [] for features in FEATURES}
+    for seed in range(len(next(iter(returns.values())))):
+        others = {arm: np.delete(own, seed, axis=0) for arm, own in returns.items()}
+        ones = [compare(others[f"{f}: frame"], others[f"{f}: input_output"]) for f in FEATURES]
+        adjusted = statistics.holm([one["p"] for one in ones])
+        for features, one, p in zip(FEATURES, ones, adjusted, strict=True):
+            found[features].append(find_verdict(one["interval"], p))
+    return found
 
 
 def find_verdict(interval: list[float], holm_p: float) -> str:
