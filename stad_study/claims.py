@@ -26,7 +26,6 @@ from stad_study.experiments import BASELINE_DRIVERS, EXPERIMENTS
 
 CLAIMS = tables.DATA / "claims.json"
 PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # on CarRacing-v0
-PAPER_BEST_AGENT = 929.82  # the highest point of its figures
 
 
 def compute_claims() -> dict[str, dict]:

@@ -267,3 +267,27 @@ def two_peaks(logpi: np.ndarray, mean: np.ndarray, logsigma: np.ndarray) -> np.n
         rise = (lower - density[row, left : right + 1].min()) / higher
         found[row] = rise, z[row, left], z[row, right]
     return found.reshape(*shape, 3)
+
+
+def clearest_case(peaks: np.ndarray, came: np.ndarray) -> tuple[tuple[int, ...], np.ndarray]:
+    """The deepest valley between two peaks of which one came true.
+
+    Args:
+        peaks: (..., 3), as `two_peaks` returns them.
+        came: what came, (...).
+
+    Returns:
+        Its place; and bool (...), where a peak came true: within a quarter of their distance.
+
+    Raises:
+        ValueError: nowhere did a peak come true.
+    """
+    rise, left, right = np.moveaxis(peaks, -1, 0)
+    miss = np.minimum(np.abs(came - left), np.abs(came - right))
+    true = (rise > 0) & (miss < (right - left) / 4)
+    if not true.any():
+        raise ValueError(
+            f"expected a density with two peaks that came true, got none of {rise.size}"
+        )
+    place = np.unravel_index(np.where(true, rise, 0).argmax(), rise.shape)
+    return tuple(int(index) for index in place), true

@@ -9,6 +9,7 @@ import torch
 from stad_lab.config import Config
 from stad_lab.envs.frames import earlier_frames, to_pictures
 from stad_lab.evaluation.metrics import (
+    clearest_case,
     constant_prediction,
     dream_open_loop,
     gaussian_nll,
@@ -195,6 +196,14 @@ def test_two_peaks_are_found_with_the_valley_between_them_and_one_peak_is_not():
     one = two_peaks(even, np.array([-0.05, 0.05]), narrow)
     both = two_peaks(*(np.stack([part] * 2) for part in (even, even, narrow)))
     assert not one.any() and both.shape == (2, 3) and not both.any()
+
+
+def test_the_clearest_case_is_the_deepest_valley_of_which_a_peak_came_true():
+    peaks = np.array([[0.9, -1.0, 1.0], [0.5, -1.0, 1.0], [0.0, 0.0, 0.0], [0.4, 0.0, 4.0]])
+    place, true = clearest_case(peaks, np.array([0.1, 0.8, 0.0, 4.5]))
+    assert place == (1,) and true.tolist() == [False, True, False, True]
+    with pytest.raises(ValueError, match="got none of 4"):
+        clearest_case(peaks, np.array([0.1, 0.0, 0.0, 2.0]))
 
 
 def test_the_road_ahead_is_where_its_upper_half_lies():
