@@ -82,7 +82,8 @@ def gains(claims: dict) -> str:
         one = study["comparisons"][f"{features}: input_output"]
         low, high = one["interval"]
         told.append(f"{one['difference'] + 0.0:.0f} points ({low:.0f} to {high:.0f})")
-    text = "Does it help to see what has moved? A paper says so. In our study of twelve pairs it"
+    text = "Does it help to see and reconstruct what has moved? A paper says so. In our study of"
+    text += " twelve pairs it"
     text += f" adds {told[1]} where the controller does not see the memory, and {told[0]} where it"
     text += f" does (95% intervals). {describe_interaction(study['afterwards']['interaction'])}"
     return text.replace(" -0 ", " 0 ")

@@ -17,9 +17,9 @@ PICTURES = NOTEBOOKS / "pictures"
 CELLS = {  # and what the front page says below
     "00-11": "How long may you disturb the agent before it is lost?",
     "01-16": "What has changed in four frames shows the speed",
-    "02-33": "A network that has to save drops the road",
+    "02-33": "With a large penalty on information, V drops the road",
     "02b-22": "How fast the car turns, read off 32 numbers",
-    "03-31": "A real drive, and four dreams of it",
+    "03-31": "A real episode, and four dreams of it",
     "04-19": "A driver evolves: cars of four generations",
     "06-15": "A good agent misses a hairpin",
 }
