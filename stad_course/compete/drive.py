@@ -124,7 +124,7 @@ def drive_batch(
     path: Path, tracks: list[int], result: dict, limits: Limits, hidden: tuple[Path, ...]
 ) -> None:
     """Drive some tracks together, or each alone if that fails; adds to the result."""
-    if (unresolved := len(result["failures"])) >= MOST_FAILURES:
+    if len(result["failures"]) >= MOST_FAILURES:
         result["returns"] += [LOST] * len(tracks)
         return
     try:
@@ -134,12 +134,12 @@ def drive_batch(
             finally:
                 result["seconds"] = driver.used
     except Failure as failure:
-        result["failures"].append(str(failure))
-        if len(tracks) == 1 or unresolved + 1 >= MOST_FAILURES:
-            result["returns"] += [LOST] * len(tracks)
-            return
-        for track in tracks:
-            drive_batch(path, [track], result, limits, hidden)
+        if len(tracks) == 1:
+            result["failures"].append(str(failure))
+            result["returns"].append(LOST)
+        else:
+            for track in tracks:
+                drive_batch(path, [track], result, limits, hidden)
         return
     first = len(result["returns"])
     result["returns"] += returns.tolist()

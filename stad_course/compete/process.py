@@ -83,7 +83,8 @@ class Submission:
         self, path: Path, limits: Limits, used: float = 0.0, hidden: tuple[Path, ...] = ()
     ):
         self.limits, self.used, self.hidden = limits, used, hidden
-        self.deadline, self.broken, self.fresh = float("inf"), "", True
+        self.deadline, self.bound = float("inf"), ""  # of the answer that is awaited
+        self.broken, self.fresh = "", True
         self.folder = Path(tempfile.mkdtemp(prefix="stad_lab-")).resolve()
         try:
             self.process = self._start(copied(path, self.folder))
@@ -167,8 +168,11 @@ class Submission:
         stdin, stdout = self.process.stdin, self.process.stdout
         assert stdin is not None and stdout is not None  # pipes
         begin = time.monotonic()
-        left = self.limits.total - self.used if kind == "act" else seconds
-        self.deadline = begin + min(seconds, left)
+        begins = kind != "act" or self.fresh
+        self.bound = f"{seconds:g} s to begin" if begins else f"{self.limits.step:g} s"
+        if kind == "act" and (left := self.limits.total - self.used) < seconds:
+            seconds, self.bound = left, f"{self.limits.total:g} s in all"
+        self.deadline = begin + seconds
         try:
             if kind:
                 send(stdin, kind, array, **fields)
@@ -205,10 +209,7 @@ class Submission:
         """Kill the process when it takes too long or too much, until it ends."""
         while self.process.poll() is None:
             if time.monotonic() > self.deadline:
-                late = self.used + self.limits.step > self.limits.total
-                over = f"{self.limits.total:g} s in all" if late else f"{self.limits.step:g} s"
-                over = over if not self.fresh else f"{self.limits.start:g} s to begin"
-                self.broken = f"it took longer than the limit of {over}"
+                self.broken = f"it took longer than the limit of {self.bound}"
             else:
                 self.broken = self._excess()
             if self.broken:

@@ -1,17 +1,25 @@
 """The competition: a submission costs itself alone, and a ranking can be continued and checked."""
 
 import json
+import zlib
 
 import numpy as np
 import pytest
-from course.submissions import CHEATS, MISBEHAVE, write_class
+from course.submissions import CHEATS, MISBEHAVE, source, write_class
 
 from stad_course.cli import main
-from stad_course.compete.drive import MOST_FAILURES, STARTER, check_submission
+from stad_course.compete.drive import (
+    LOST,
+    MOST_FAILURES,
+    STARTER,
+    check_submission,
+    drive_batch,
+)
 from stad_course.compete.limits import Limits
 from stad_course.compete.process import Submission, can_isolate
 from stad_course.compete.ranking import rank
 from stad_course.compete.tracks import hide_tracks
+from stad_lab.envs.cars import Cars
 from stad_lab.io.files import load_json
 
 SHORT = ("--limits.start", "20", "--limits.step", "0.5")
@@ -156,6 +164,28 @@ def test_what_would_cost_results_is_refused_in_one_line(arguments, expected, tmp
     captured = capsys.readouterr()
     assert expected in captured.err and len(captured.err.strip().splitlines()) == 1
     assert agent.read_bytes() == (STARTER / "my_agent.py").read_bytes()
+
+
+def test_each_track_on_which_a_submission_breaks_down_costs_that_track_alone(tmp_path):
+    cars = Cars(2)
+    cars.reset([3, 13])
+    bad = [zlib.crc32(picture.tobytes()) for picture in cars.draw()]
+    line = f"if zlib.crc32(observation.tobytes()) in {bad}: raise ValueError(self.frame)"
+    path = tmp_path / "breaks.py"
+    path.write_text("import zlib\n" + source("act", line))
+    result = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
+    for tracks in (range(8), range(8, 16)):
+        drive_batch(path, list(tracks), result, Limits(), ())
+    assert [n for n, own in enumerate(result["returns"]) if own == LOST] == [3, 13]
+    assert len(result["failures"]) == 2
+
+
+def test_who_used_up_the_whole_time_reads_the_limit_of_the_whole(tmp_path):
+    path = tmp_path / "slow.py"
+    path.write_text(source("act", "time.sleep(0.3 if self.frame > 1 else 0)"))
+    result = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
+    drive_batch(path, [0], result, Limits(step=2.0, total=1.0), ())
+    assert "the limit of 1 s in all" in result["failures"][0]
 
 
 @pytest.mark.parametrize(
