@@ -55,7 +55,7 @@ def result_file(file: Path | None, source: str, kind: str, details: str = "") ->
     from stad_lab.evaluation.evaluate import check_output
 
     run = run_folder(source)
-    name = f"{kind}-{run.name}{details}.json"
+    name = f"{kind}-{run.resolve().name}{details}.json"
     file = file or (Path(name) if run.parent == PRETRAINED else run / name)
     check_output(file)
     return file
@@ -125,7 +125,7 @@ def fine_tune(
         generations: Of CMA-ES, a multiple of 5; 15 if not given.
         sigma: Initial step size; 0.02 if not given.
         seed: Of the candidates and tracks; the run's own if not given.
-        processes: Worker processes.
+        processes: Workers that drive.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
     from stad_lab.agent import run_folder
@@ -158,7 +158,7 @@ def evaluate(
         episodes: Number of tracks.
         first_track: Seed of the first track.
         fast: Render with the fast renderer instead of Gymnasium's own (not for reports).
-        processes: Worker processes.
+        processes: Workers that drive.
         json: Where to write every episode; by default into the run, or here for a shipped agent.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
@@ -205,7 +205,7 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
     Args:
         run: A shipped agent, or the folder of a run.
         episodes: Of the random driver; an agent drives a third as many.
-        processes: Worker processes.
+        processes: Workers that drive.
         json: Where to write the result; by default into the run, or here for a shipped agent.
     """
     from stad_lab.agent import run_folder

@@ -155,7 +155,7 @@ class Config:
     seed: int = 0
     """Seed of the dataset, of the initial weights and of the training."""
     processes: int = 2
-    """Worker processes; the results do not depend on their number."""
+    """Workers that drive; the results do not depend on their number."""
     data: DataConfig = field(default_factory=DataConfig)
     vae: VAEConfig = field(default_factory=VAEConfig)
     mdn_rnn: MDNRNNConfig = field(default_factory=MDNRNNConfig)

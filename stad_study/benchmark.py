@@ -57,6 +57,10 @@ GYMNASIUM, ENVPOOL = "Gymnasium", "EnvPool"
 CARS = 16  # in a batch
 V_STEPS, M_STEPS, WARM_UP = 60, 12, 5  # training steps of a round, the first of them not timed
 
+WHOLE_RUNS = {  # name -> preset, and who renders in the evaluation
+    "minutes of a whole run": ("laptop", ["our engine", GYMNASIUM]),
+    "minutes of a whole run, fast": ("fast", ["our engine"]),
+}
 # Name -> function of the round that gives a speed.
 Contenders = Mapping[str, Callable[[int], float]]
 
@@ -310,10 +314,7 @@ def training_speed(training: Training, items: int) -> float:
 
 def measure_run(rounds: int) -> dict:
     """A whole run of each preset, with the evaluation of its agent on 100 tracks."""
-    return {
-        "minutes of a whole run": time_run("laptop", ["our engine", GYMNASIUM]),
-        "minutes of a whole run, fast": time_run("fast", ["our engine"]),
-    }
+    return {name: time_run(*run) for name, run in WHOLE_RUNS.items()}
 
 
 def time_run(preset: str, renderers: list[str]) -> dict[str, float]:

@@ -79,7 +79,7 @@ def evaluate(
     """Drive the kept agents of a study on any tracks, with the fast renderer.
 
     The tracks of the study's own score give its returns again, bit-identical on the same kind of
-    processor.
+    processor. Stop it when you like: with --json the same command continues.
 
     Args:
         study: Its name, such as study1.
@@ -92,14 +92,17 @@ def evaluate(
     """
     from stad_lab.evaluation.evaluate import check_output, check_tracks
     from stad_lab.io.files import save_json
-    from stad_study.study import evaluate_kept
+    from stad_study.study import evaluate_kept, read_driven
 
     check_tracks(episodes, first_track)
+    found: dict[str, dict] = {}
+    tracks = range(first_track, first_track + episodes)
     if json:
         check_output(json)
-    found, tracks = {}, range(first_track, first_track + episodes)
+        found = read_driven(json, study, tracks)
     with cluster_of(scheduler) as executor:
-        for pipeline, result in evaluate_kept(study, tracks, seeds, only, executor=executor):
+        agents = evaluate_kept(study, tracks, seeds, only, executor=executor, driven=list(found))
+        for pipeline, result in agents:
             low, high = result["interval"]
             text = f"mean return {result['mean']:.1f}, 95% interval {low:.1f} to {high:.1f}"
             print(f"{pipeline.name}: {text}", flush=True)
@@ -118,12 +121,26 @@ def probe(
     Args:
         study: Its name, such as study1.
         seeds: Some of its seeds; all complete ones if not given.
-        processes: Worker processes.
+        processes: Workers that drive.
     """
     from stad_study.study_probe import probe_study
 
     probed = probe_study(study, seeds, processes=processes)
     print(f"probed the seeds {probed}" if probed else "no further seed is complete: nothing to do")
+
+
+def erasure(run: tyro.conf.Positional[str], processes: int = 2) -> None:
+    """Measure what is left of the motion in z after the erasure of study 5: its pilot.
+
+    Args:
+        run: Folder of a run's V and M, or a shipped agent.
+        processes: Workers that drive.
+    """
+    from stad_lab.agent import run_folder
+    from stad_lab.io.weights import load_world_model
+    from stad_study.world_facts import describe_erasure, measure_erasure
+
+    print(describe_erasure(measure_erasure(load_world_model(run_folder(run)), processes=processes)))
 
 
 def claims() -> None:
@@ -200,12 +217,13 @@ COMMANDS: dict[str, Callable] = {
     "replicate": replicate,
     "evaluate": evaluate,
     "probe": probe,
+    "erasure": erasure,
     "claims": claims,
     "latents": latents,
     "benchmark": benchmark,
     "ship": ship,
 }
-CONTINUES = ("replicate", "probe", "latents")
+CONTINUES = ("replicate", "evaluate", "probe", "latents")
 PROGRAM = command_line.Program(
     "python -m stad_study", "Repeat what the replication ran.", COMMANDS, CONTINUES
 )

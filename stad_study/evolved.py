@@ -2,7 +2,7 @@
 
 A world is the V and M of one seed and variant, in 16 bits. In the folder of a study each run has a
 folder of its own name, with the log of CMA-ES and the score. Whatever is there is not done again. A
-finished run is added to the tables, and its C to `networks`.
+finished run is added to the tables, and its C to `networks` beside them.
 """
 
 import contextlib
@@ -244,9 +244,7 @@ def keep_controller(study: Evolved, run: EvolvedRun, controller: np.ndarray, fol
 
 def recorded(study: Evolved, run: EvolvedRun, to: Path = tables.DATA) -> dict | None:
     """The line of a run in the table of runs; None if it is not there."""
-    table = tables.read_or_empty(f"{study.name}_runs", to)
-    own = table[(table[study.key] == list(run._asdict().values())).all(axis=1)]
-    return own.iloc[0].to_dict() if len(own) else None
+    return tables.line_of(f"{study.name}_runs", tuple(run._asdict().values()), to)
 
 
 def compare(run: EvolvedRun, was: dict, root: Path) -> str:

@@ -81,6 +81,14 @@ def load_kept_agent(path: Path) -> Agent:
     return Agent(world_model, parameters)
 
 
+def find_world_model(networks: Path, study: str, seed: int, variant: str) -> Path:
+    """The file of a kept V and M; FileNotFoundError says how to get it."""
+    path = networks / study / f"seed{seed}" / variant / WORLD_MODEL_FILE
+    if not path.exists():
+        raise FileNotFoundError(f"{path} is not there: {how_to_get(study)}")
+    return path
+
+
 def how_to_get(study: str) -> str:
     """What to do about kept agents that are not there, for a message."""
     if not NETWORKS.is_dir():

@@ -1,4 +1,4 @@
-"""What C sees in study 5: z of a kept V, with motion added to it or taken out of it.
+"""What C sees in studies 2 and 5: z of a kept V, in study 5 also with motion added or taken out.
 
 The motion is three numbers that the simulator knows: slip speed, yaw rate and wheel angle. They are
 added to z after division by their standard deviation in the seed's dataset, or erased from z by the

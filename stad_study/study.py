@@ -14,7 +14,7 @@ run, unless one is asked for by its name: then it is compared with what the tabl
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -67,7 +67,6 @@ MADE_WITH = ("commit", "processor", "threads", "torch", "trained_on")  # that is
 class Study:
     """What is run, and how each pipeline is scored."""
 
-    about: str
     seeds: Sequence[int]
     variants: tuple[str, ...] = VARIANTS
     features: tuple[str, ...] = ("z", "z, h")  # what C sees
@@ -79,12 +78,10 @@ class Study:
 
 PAIRS = range(200, 206), ("frame", "input_output"), ("z, h",)  # seeds, variants, features
 STUDIES = {
-    "study1": Study("Do difference images earn points?", range(12)),
-    "pilot": Study("a seed outside study1", (100,), ("frame", "input_output")),
-    "study6_laptop": Study("the laptop preset", *PAIRS, keeps_networks=False),
-    "study6_fast": Study(
-        "the fast preset", *PAIRS, config=Config.preset("fast"), keeps_networks=False
-    ),
+    "study1": Study(range(12)),
+    "pilot": Study((100,), ("frame", "input_output"), keeps_networks=False),
+    "study6_laptop": Study(*PAIRS, keeps_networks=False),
+    "study6_fast": Study(*PAIRS, config=Config.preset("fast"), keeps_networks=False),
 }
 
 
@@ -303,9 +300,7 @@ def drive_tracks(
 
 def recorded(pipeline: Pipeline, to: Path = tables.DATA) -> dict | None:
     """The line of a pipeline in the table of runs; None if it is not there."""
-    table = tables.read_study("runs", to)
-    own = table[(table[PIPELINE] == list(pipeline)).all(axis=1)]
-    return own.iloc[0].to_dict() if len(own) else None
+    return tables.line_of("study_runs", pipeline, to)
 
 
 def add_pipeline(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> None:
@@ -386,15 +381,15 @@ def compare(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> str:
     again = {episode["track"]: episode["return"] for episode in score["episodes"]}
     other = sum(before[track] != value for track, value in again.items())
     differs = [name for name in CHECKSUMS if was[name] != now[name]]
-    if not differs and not other:
+    differs += [f"{other} of {len(again)} returns"] * bool(other)
+    if not differs:
         return f"bit-identical to the recorded one, all {len(again)} returns, too"
     made = [
         f"{line['processor']}, V and M on {line['world_model.trained_on']} with PyTorch"
         f" {line['world_model.torch']}"
         for line in (was, now)
     ]
-    found = f"differs in {', '.join(differs)} and {other} of {len(again)} returns"
-    return f"{found}; recorded on {made[0]}, here {made[1]}"
+    return f"differs in {', '.join(differs)}; recorded on {made[0]}, here {made[1]}"
 
 
 def describe_score(pipeline: Pipeline, root: Path) -> str:
@@ -420,6 +415,25 @@ def describe_progress(study: str, wanted: list[Pipeline], to: Path = tables.DATA
     return f"{text}, about {np.dot(counts, seconds) / 3600:.1f} hours are left"
 
 
+def check_kept(study: str) -> None:
+    """ValueError if the agents of a study are not kept."""
+    if not STUDIES[study].keeps_networks:
+        raise ValueError(f"study {study!r} keeps no agents: its returns are in the tables")
+
+
+def read_driven(file: Path, study: str, tracks: Sequence[int]) -> dict[str, dict]:
+    """Name -> what `evaluate_kept` gave for it before; empty if the file is not there.
+
+    ValueError if it holds another study, or other tracks.
+    """
+    known = load_json(file, kind="study") if file.exists() else {"study": study, "agents": {}}
+    driven = [[one["track"] for one in own["episodes"]] for own in known["agents"].values()]
+    if known["study"] != study or any(own != list(tracks) for own in driven):
+        remedy = "give another file with --json"
+        raise ValueError(f"{file} holds another study, or other tracks: {remedy}")
+    return known["agents"]
+
+
 def evaluate_kept(
     study: str,
     tracks: Sequence[int],
@@ -427,19 +441,20 @@ def evaluate_kept(
     only: Sequence[str] | None = None,
     networks: Path = NETWORKS,
     executor: Executor | None = None,
+    driven: Collection[str] = (),
 ) -> Iterator[tuple[Pipeline, dict]]:
     """Drive the kept agents of a study on any tracks, at least 0; yields what `report` returns.
 
+    Those of the names in `driven` are left out. ValueError for a study that keeps no agents;
     FileNotFoundError if an agent that is asked for by name is not there, or if none is.
     """
     wanted, folder = find_pipelines(study, seeds, only), networks / study
-    if not STUDIES[study].keeps_networks:
-        raise ValueError(f"study {study!r} keeps no agents: its returns are in the tables")
+    check_kept(study)
     there = [one for one in wanted if kept_file(one, folder).exists()]
     if not there or (only and len(there) < len(wanted)):
         raise FileNotFoundError(f"{folder} has no agents of these names: {how_to_get(study)}")
     if others := len(wanted) - len(there):
         print(f"{others} agents are not there: {how_to_get(study)}", flush=True)
-    for pipeline in there:
+    for pipeline in (one for one in there if one.name not in driven):
         agent = load_kept_agent(kept_file(pipeline, folder))
         yield pipeline, drive_tracks(agent, tracks, 2, executor, pipeline.name)

@@ -16,9 +16,9 @@ from stad_lab.io.files import locked
 from stad_lab.training.subspace import COMPONENTS_FILE, save_components
 from stad_study import tables
 from stad_study.evolved import Evolved
-from stad_study.networks import WORLD_MODEL_FILE, load_kept_world_model
+from stad_study.networks import find_world_model, load_kept_world_model
 from stad_study.senses import Sense
-from stad_study.study import STUDIES
+from stad_study.study import COLLECTING, STUDIES
 from stad_study.world_facts import WORLD_FILE, load_sense, prepare_seed
 
 REPEATS = (1, 2, 3)
@@ -69,12 +69,13 @@ def parts_of_study5(_: Path = tables.DATA) -> dict[str, list[Run]]:
 
 def prepare(run: Run, root: Path, networks: Path) -> Sense:
     """What C drives with; writes the facts of the seed's worlds, and the components of the run."""
-    world, folder = root / f"seed{run.seed}" / run.variant / WORLD_FILE, root / run.name
-    if not world.exists():
-        with locked(root / f"seed{run.seed}", 3600.0):
-            prepare_seed(run.seed, root / f"seed{run.seed}", networks / "study1")
-    kept = networks / "study1" / f"seed{run.seed}" / run.variant / WORLD_MODEL_FILE
-    sense, components = load_sense(world, load_kept_world_model(kept), run.sees)
+    seed, folder = root / f"seed{run.seed}", root / run.name
+    model = load_kept_world_model(find_world_model(networks, "study1", run.seed, run.variant))
+    world = seed / run.variant / WORLD_FILE
+    with locked(seed, COLLECTING):  # another process may be writing it
+        if not world.exists():
+            prepare_seed(run.seed, seed, networks)
+    sense, components = load_sense(world, model, run.sees)
     if not (folder / COMPONENTS_FILE).exists():
         depends_on = {"variant": run.variant, "features": run.config.evolution.features}
         metadata = {**depends_on, "count": run.config.evolution.components, **sense.checksums}

@@ -22,17 +22,17 @@ MARGIN = 30  # points of equivalence
 LEVEL = 0.05  # of Holm's p
 
 
-def describe_study1(folder: Path = tables.DATA, study: str = "study1") -> dict:
+def describe_study1(folder: Path = tables.DATA) -> dict:
     """Progress; and once all seeds are complete arms, comparisons, curves, and "afterwards".
 
     An arm or comparison is named by features and variant: "z: input_output".
     """
-    planned, runs = STUDIES[study], tables.read_study("runs", folder)
-    found = describe_progress(planned, runs[runs["study"] == study])
+    planned, runs = STUDIES["study1"], tables.read_study("runs", folder)
+    found = describe_progress(planned, runs[runs["study"] == "study1"])
     if found["complete_seeds"] < found["planned_seeds"]:
         return found
-    returns = returns_of_study(study, folder)
-    curves = learning_curves(study, folder)
+    returns = returns_of_study("study1", folder)
+    curves = learning_curves("study1", folder)
     areas = {arm: area_under(*curve) for arm, curve in curves.items()}
     comparisons: dict[str, dict] = {}
     for variants in FAMILIES.values():
@@ -219,17 +219,17 @@ def curve_differences(curves: dict[str, tuple]) -> dict[str, dict[str, list[floa
     return found
 
 
-def describe_study3(folder: Path = tables.DATA, study: str = "study1") -> dict:
+def describe_study3(folder: Path = tables.DATA) -> dict:
     """R2 of the probe over the seeds so far: "DRIVER: VARIANT" -> features -> quantity.
 
     "values" has a number for each seed, and "interval" is of their mean. Untrained networks have
     names such as "frame, untrained".
     """
     table = tables.read_study("probe", folder)
-    table = table[table["study"] == study]
+    table = table[table["study"] == "study1"]
     found: dict[str, Any] = {
         "seeds": int(table["seed"].nunique()),
-        "planned_seeds": len(STUDIES[study].seeds),
+        "planned_seeds": len(STUDIES["study1"].seeds),
     }
     probed = table[table["trained"].astype(bool)]
     found["networks"] = len(probed[["variant", "seed"]].drop_duplicates())

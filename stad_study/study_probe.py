@@ -25,16 +25,12 @@ from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training.trainer import torch_settings
 from stad_study import tables
-from stad_study.networks import (
-    NETWORKS,
-    WORLD_MODEL_FILE,
-    how_to_get,
-    load_kept_world_model,
-)
+from stad_study.networks import NETWORKS, find_world_model, load_kept_world_model
 from stad_study.study import (
     STUDIES,
     WAIT,
     Pipeline,
+    check_kept,
     find_pipelines,
     fixed_threads,
     recorded,
@@ -54,8 +50,9 @@ def probe_study(
 ) -> list[int]:
     """Probe the complete seeds that the table lacks, and add each to it; returns their numbers.
 
-    After an interruption the same call continues. ValueError as `find_pipelines`, and for a kept
-    file with another checksum than in the table of runs; FileNotFoundError for one that is missing.
+    After an interruption the same call continues. ValueError as `find_pipelines` and `check_kept`,
+    and for a kept file with another checksum than in the table of runs; FileNotFoundError for one
+    that is missing.
     """
     missing = seeds_to_probe(study, seeds, to)
     kept = {seed: kept_world_models(study, seed, to, networks) for seed in missing}
@@ -85,6 +82,7 @@ def probe_study(
 def seeds_to_probe(study: str, seeds: Sequence[int] | None, to: Path) -> list[int]:
     """The seeds whose pipelines are all in the table of runs, and none in that of the probe."""
     wanted = find_pipelines(study, seeds)
+    check_kept(study)
     complete = set(STUDIES[study].seeds) - {one.seed for one in wanted if recorded(one, to) is None}
     table = tables.read_study("probe", to)
     done = set(table.loc[table["study"] == study, "seed"])
@@ -96,9 +94,7 @@ def kept_world_models(study: str, seed: int, to: Path, networks: Path) -> dict[s
     files = {}
     for variant in STUDIES[study].variants:
         pipeline = Pipeline(study, variant, STUDIES[study].features[0], seed)
-        files[variant] = networks / study / f"seed{seed}" / variant / WORLD_MODEL_FILE
-        if not files[variant].exists():
-            raise FileNotFoundError(f"{files[variant]} is not there: {how_to_get(study)}")
+        files[variant] = find_world_model(networks, study, seed, variant)
         line = recorded(pipeline, to) or {}
         if checksum(files[variant].read_bytes()) != line.get("kept_world_model"):
             raise ValueError(f"{files[variant]} is not the file of the recorded run")

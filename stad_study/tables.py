@@ -9,6 +9,7 @@ has lines in the tables `study_runs`, `study_generations` and `study_episodes`. 
 is in `study_probe`.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +76,13 @@ def read_or_empty(name: str, folder: Path = DATA) -> pandas.DataFrame:
         keys, values = TABLES[name]
         return pandas.DataFrame(columns=[*keys, *values])
     return read(name, folder)
+
+
+def line_of(name: str, key: Sequence, folder: Path = DATA) -> dict | None:
+    """The line with the values `key` in the columns that name lines; None if it is not there."""
+    table = read_or_empty(name, folder)
+    own = table[(table[TABLES[name][0]] == list(key)).all(axis=1)]
+    return own.iloc[0].to_dict() if len(own) else None
 
 
 def episodes(folder: Path = DATA) -> pandas.DataFrame:

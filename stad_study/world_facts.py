@@ -18,18 +18,21 @@ from stad_lab.evaluation.probe_run import (
     AGENT,
     PROBE_SEED,
     PROBED,
+    agent_trajectories,
+    frames_in_sight,
     random_trajectories,
     two_drivers,
 )
-from stad_lab.evaluation.trajectories import Trajectory, encode_trajectory, road_in_sight
+from stad_lab.evaluation.trajectories import Trajectory, encode_trajectory
 from stad_lab.features import encode_episode, remember_episode
 from stad_lab.io.files import save_tensors
 from stad_lab.io.weights import WorldModel, check_belongs, load_kind
 from stad_lab.training.dataset import random_start
 from stad_lab.training.subspace import principal_components
-from stad_study.networks import WORLD_MODEL_FILE, load_kept_world_model
+from stad_study.networks import find_world_model, load_kept_world_model
 from stad_study.senses import (
     COLUMNS,
+    ERASED,
     SEES,
     Eraser,
     Sense,
@@ -51,16 +54,16 @@ def prepare_seed(seed: int, folder: Path, networks: Path) -> None:
     """Write `folder/VARIANT/world.safetensors` for the worlds of a seed.
 
     Args:
-        networks: the folder with the kept V and M of the study that the worlds come from.
+        networks: the folder with the kept V and M of study 1, which the worlds come from.
 
-    Raises FileNotFoundError or ValueError as `load_kept_world_model`.
+    Raises FileNotFoundError or ValueError as `find_world_model` and `load_kept_world_model`.
     """
-    kept = {one: networks / f"seed{seed}" / one / WORLD_MODEL_FILE for one in SENSED_VARIANTS}
-    models = {one: load_kept_world_model(file) for one, file in kept.items() if file.exists()}
+    kept = {one: find_world_model(networks, "study1", seed, one) for one in SENSED_VARIANTS}
+    models = {one: load_kept_world_model(file) for one, file in kept.items()}
     config = STUDIES["study1"].config.replace(seed=seed)
     count = range(config.data.episodes)
     episodes = [drive_with_motion(config, i) for i in tqdm(count, f"dataset of seed {seed}")]
-    driven, skip = two_drivers(random_trajectories(PROBED, PROBE_SEED, 1), 1)["trained agent"]
+    driven, skip = agent_trajectories(PROBED, 1)
     others = placebo_episodes()
     for variant, model in models.items():
         erasers = fit_erasers(model, driven, skip, random_stream("bootstrap", seed, 5))
@@ -180,13 +183,15 @@ def sense_of(facts: dict[str, np.ndarray], model: WorldModel, sees: str) -> Sens
     return Sense(model, sees, eraser, facts.get(f"{sees}.scale"), others)
 
 
-def measure_erasure(model: WorldModel, processes: int = 2) -> dict[str, dict[str, dict]]:
+def measure_erasure(
+    model: WorldModel, count: int = PROBED, processes: int = 2
+) -> dict[str, dict[str, dict]]:
     """What a linear probe reads from z with and without the erasers, on held-out episodes.
 
-    The erasers are fitted as for the runs, on an agent's episodes. Driver -> what C sees ->
-    "r2" of each quantity of ERASED (3,), and "variance", the share of z's variance that is left.
+    The erasers are fitted as for the runs, on an agent's episodes. Driver -> what C sees -> "r2"
+    of each of ERASED, and "variance", the share of z's variance that is left.
     """
-    drivers = two_drivers(random_trajectories(PROBED, PROBE_SEED, processes), processes)
+    drivers = two_drivers(random_trajectories(count, PROBE_SEED, processes), processes)
     erasers = fit_erasers(model, *drivers["trained agent"], random_stream("bootstrap", 0, 5))
     found: dict = {}
     for driver, (driven, skip) in drivers.items():
@@ -200,13 +205,21 @@ def measure_erasure(model: WorldModel, processes: int = 2) -> dict[str, dict[str
     return found
 
 
+def describe_erasure(found: dict[str, dict[str, dict]]) -> str:
+    """What `measure_erasure` found, in lines."""
+    head = "".join(f"{one:>14}" for one in (*ERASED, "variance"))
+    lines = [f"{'R2 on held-out episodes':<24}{head}"]
+    for driver, by_sight in found.items():
+        for sees, one in by_sight.items():
+            numbers = "".join(f"{value + 0.0:14.2f}" for value in [*one["r2"], one["variance"]])
+            lines.append(f"{driver + ': ' + sees:<24}{numbers}")
+    return "\n".join(lines)
+
+
 def rows_in_sight(
     model: WorldModel, driven: list[Trajectory], skip: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """z, motion and number of the episode of every frame that the probe counts."""
     encoded = [encode_trajectory(model.vae, one, model.stride, model.crop_bar)[0] for one in driven]
-    latents, motion = np.concatenate(encoded), np.concatenate([one.motion for one in driven])
-    number = np.repeat(np.arange(len(driven)), [len(one) for one in driven])
-    moment = np.concatenate([np.arange(len(one)) for one in driven])
-    kept = road_in_sight(motion) & (moment >= skip)
-    return latents[kept], motion[kept], number[kept]
+    kept, motion, number = frames_in_sight(driven, skip)
+    return np.concatenate(encoded)[kept], motion[kept], number[kept]

@@ -1,4 +1,4 @@
-"""The configuration: three presets, and a clear error for every wrong value."""
+"""The configuration: presets, and a clear error for every wrong value."""
 
 import dataclasses
 import inspect

@@ -28,7 +28,7 @@ RANDOM_FRAMES, AGENT_FRAMES = 150, 360  # of a trajectory of the random driver, 
 # First frames that are not probed: without a difference image, or with the opening zoom.
 RANDOM_SKIP, AGENT_SKIP = LONGEST_STRIDE, 60
 FEWEST = 12  # trajectories: a probe is fitted on some and measured on others
-PROBED, PROBE_SEED = 180, 100  # trajectories when one run is probed; no dataset has this seed
+PROBED, PROBE_SEED = 180, 100  # trajectories when one run is probed; no counted run has this seed
 AGENT = "cropped_input"  # the competent driver whose trajectories are probed
 
 
@@ -63,17 +63,34 @@ def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, Driven]:
 
     Returns driver -> (trajectories, number of first frames of each that are not probed).
     """
-    tracks = track_seeds("inspect", max(FEWEST, len(driven) // 3), 2)
+    by_agent = agent_trajectories(len(driven), processes)
+    return {"random driver": (driven, RANDOM_SKIP), "trained agent": by_agent}
+
+
+def agent_trajectories(count: int, processes: int) -> Driven:
+    """Trajectories of AGENT, on tracks kept for inspection: a third of `count`."""
+    tracks = track_seeds("inspect", max(FEWEST, count // 3), 2)
     tasks = [(load_agent(AGENT), track, AGENT_FRAMES) for track in tracks]
     with worker_threads(processes) as executor:
-        by_agent = run_in_order(executor, record_trajectory, tasks, "trained agent")
-    return {"random driver": (driven, RANDOM_SKIP), "trained agent": (by_agent, AGENT_SKIP)}
+        return run_in_order(executor, record_trajectory, tasks, "trained agent"), AGENT_SKIP
+
+
+def frames_in_sight(
+    driven: list[Trajectory], skip: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Which frames the probe counts, bool (frames,), with the motion and trajectory of each.
+
+    They show the road, after the first `skip` of each trajectory.
+    """
+    motion = np.concatenate([one.motion for one in driven])
+    number = np.repeat(np.arange(len(driven)), [len(one) for one in driven])
+    moment = np.concatenate([np.arange(len(one)) for one in driven])
+    return road_in_sight(motion) & (moment >= skip), motion, number
 
 
 def probe_trajectories(driven: list[Trajectory], skip: int, encoder: Encoder) -> dict:
     """Probe the mean of z, which C sees, and z with the memory of each M.
 
-    Only frames count in which the road is in sight, after the first `skip` of each trajectory.
     Returns {"z": {quantity: {"r2": number, "interval": [low, high]}}}, and so for every M.
     """
     vae, stride, crop_bar, memories = encoder
@@ -83,10 +100,7 @@ def probe_trajectories(driven: list[Trajectory], skip: int, encoder: Encoder) ->
         pairs = zip(latents, driven, strict=True)
         hidden = [remember_episode(mdn_rnn, z, one.actions) for z, one in pairs]
         features[name] = np.concatenate([features["z"], np.concatenate(hidden)], axis=1)
-    motion = np.concatenate([one.motion for one in driven])
-    number = np.repeat(np.arange(len(driven)), [len(one) for one in driven])
-    moment = np.concatenate([np.arange(len(one)) for one in driven])
-    kept = road_in_sight(motion) & (moment >= skip)
+    kept, motion, number = frames_in_sight(driven, skip)
     result = {}
     for name, seen in features.items():
         found = probe(seen[kept], motion[kept], number[kept])

@@ -60,19 +60,6 @@ class Recorder:
         return Trajectory(observations, actions, np.array(rewards, np.float32), motion)
 
 
-def driven_path(motion: np.ndarray) -> np.ndarray:
-    """The car's path by dead reckoning: float32 (T, 6) -> world units (T, 2) from (0, 0).
-
-    The car first heads upward. The speeds along and across it are turned by the sum of the yaw
-    rates, and summed.
-    """
-    forward, slip, yaw_rate = motion[:, :3].astype(float).T / FRAMES_A_SECOND
-    heading = np.cumsum(yaw_rate) - yaw_rate
-    east = slip * np.cos(heading) - forward * np.sin(heading)
-    north = slip * np.sin(heading) + forward * np.cos(heading)
-    return np.stack([np.cumsum(east) - east, np.cumsum(north) - north], axis=1)
-
-
 def road_in_sight(motion: np.ndarray) -> np.ndarray:
     """Whether the car is within 3 half road widths of the centre and heads along: bool (T,).
 

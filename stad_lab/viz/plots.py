@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from stad_lab.evaluation.statistics import SOLVED
-from stad_lab.evaluation.trajectories import MOTION, Inspection, Trajectory
+from stad_lab.evaluation.trajectories import MOTION
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY = "#CC79A7", "#56B4E9"
@@ -123,53 +123,6 @@ def plot_pictures(
         figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label=scale_name)
     lead = f"Rows: {', '.join(filter(None, names)) or 'one'}; columns: "
     return describe(figure, title, lead, columns)
-
-
-def plot_moment(trajectory: Trajectory, inspection: Inspection, moment: int) -> Figure:
-    """Frame `moment` of an episode: pictures, latents, prediction, action, and the return so far.
-
-    Raises ValueError for a moment outside the episode.
-    """
-    length = len(trajectory)
-    if not 0 <= moment < length:
-        raise ValueError(f"moment={moment}: expected 0 to {length - 1}, a frame of the episode")
-    figure = Figure(figsize=(9.5, 5.6), layout="constrained", dpi=100)
-    parts: Any = figure.subfigures(3, 1, height_ratios=[1.6, 1.25, 0.8])
-    above, middle, below = parts
-    pictures = {
-        "observation": trajectory.observations[moment],
-        "frame x": inspection.frames[moment],
-        "difference d": difference_colors(inspection.differences[moment]),
-        "V's frame": inspection.frame_reconstructions[moment],
-    }
-    if inspection.difference_reconstructions is not None:
-        reconstruction = inspection.difference_reconstructions[moment]
-        pictures["V's difference"] = difference_colors(reconstruction)
-    axes = above.subplots(1, len(pictures))
-    for (name, picture), axis in zip(pictures.items(), axes, strict=True):
-        show_picture(axis, picture)
-        caption(axis, name)
-    latents, weights, action = middle.subplots(1, 3, width_ratios=[2, 2, 1])
-    latents.bar(np.arange(inspection.mu.shape[1]), inspection.mu[moment], color=BLUE, width=0.9)
-    reach = np.abs(inspection.mu).max()
-    latents.set(ylim=(-reach, reach), xlabel="latent", ylabel="z")
-    shares = inspection.mixture.logpi[0, moment].exp().numpy().T
-    weights.imshow(shares, aspect="auto", cmap="cividis", vmin=0, vmax=1, interpolation="nearest")
-    weights.set(xlabel="latent", ylabel="Gaussian", yticks=[])
-    weights.set_title("M's mixture weights for the next z (yellow: 1)", fontsize=9)
-    names, colors = ["steering", "gas", "brake"], [ORANGE, GREEN, RED]
-    action.barh(names, trajectory.actions[moment], color=colors)
-    action.set(xlim=(-1, 1))
-    action.invert_yaxis()
-    action.axvline(0, color="black", lw=0.8)
-    reward = below.subplots()
-    reward.plot(trajectory.rewards.cumsum(), color=GREEN)
-    reward.axvline(moment, color="black", lw=1)
-    reward.set(xlabel="frame", ylabel="return so far", xlim=(0, length - 1))
-    speed, earned = trajectory.motion[moment, 0], trajectory.rewards[moment]
-    title = f"Frame {moment} of {length}: speed {speed:.0f} world units per second"
-    content = "Observation, frame, difference, reconstruction, z, mixture weights, action, return"
-    return describe(figure, f"{title}, reward {earned:+.1f}", content)
 
 
 # V, M and C

@@ -11,7 +11,6 @@ from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.trajectories import (
     MOTION,
     Recorder,
-    driven_path,
     encode_trajectory,
     inspect_trajectory,
     record_random_trajectory,
@@ -67,16 +66,6 @@ def test_speed_along_and_across_are_separate_and_left_is_positive(cars):
         cars.step(np.array([[-1, 0.2, 0]]))  # steering to the left
     motion = motion_of(cars)
     assert motion["yaw rate"] > 0.1 and motion["wheel angle"] > 0.1
-
-
-def test_the_path_goes_up_and_turns_with_the_yaw_rate():
-    motion = np.zeros((100, len(MOTION)), np.float32)
-    motion[:, 0] = 50  # a unit for each frame
-    assert driven_path(motion)[-1] == pytest.approx([0, 99])
-    motion[:, 2] = 50 * 2 * np.pi / 100  # a circle to the left
-    path = driven_path(motion)
-    assert path[50] == pytest.approx([-100 / np.pi, 0], abs=2)
-    assert path[-1] == pytest.approx(path[0], abs=2)
 
 
 def test_the_road_is_in_sight_near_it_and_along_it_only():

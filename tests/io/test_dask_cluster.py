@@ -132,10 +132,12 @@ def test_the_command_line_runs_an_experiment_on_a_cluster(scheduler, tmp_path, m
 def test_the_command_line_runs_a_study_on_a_cluster(scheduler, tmp_path, monkeypatch, capsys):
     evolution = {"generations": 2, "max_frames": 20, "components": 4}
     config = QUICK.replace(vae={"steps": 4}, mdn_rnn={"steps": 2}, evolution=evolution)
-    brief = Study("one pipeline", (0,), ("input_output",), ("z, h",), config, range(1000, 1003), 20)
+    brief = Study((0,), ("input_output",), ("z, h",), config, range(1000, 1003), 20)
     monkeypatch.setitem(STUDIES, "brief", brief)
     monkeypatch.setattr(run_study, "__defaults__", (None, None, None, tmp_path / "data"))
-    monkeypatch.setattr(evaluate_kept, "__defaults__", (None, None, tmp_path / "networks", None))
+    monkeypatch.setattr(
+        evaluate_kept, "__defaults__", (None, None, tmp_path / "networks", None, ())
+    )
     name, far, episodes = "seed0/input_output/z_h", ["--scheduler", scheduler[0]], []
     assert study.main(["replicate", "brief", "--out", str(tmp_path / "far"), *far]) == 0
     assert study.main(["replicate", "brief", "--only", name, "--out", str(tmp_path / "near")]) == 0

@@ -73,7 +73,7 @@ def test_both_renderers_are_compared_frame_by_frame(number):
 
 @pytest.mark.long
 def test_the_whole_benchmark_runs_to_its_end(tmp_path, monkeypatch):
-    monkeypatch.setattr("stad_study.benchmark.PRESET", "quick")
+    monkeypatch.setattr("stad_study.benchmark.WHOLE_RUNS", {"a run": ("quick", ["our engine"])})
     file = tmp_path / "benchmark.json"
     assert main(["benchmark", "--rounds", "1", "--json", str(file)]) == 0
     assert {"made_with", "rounds", *PARTS} <= load_json(file).keys()

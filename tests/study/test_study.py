@@ -34,7 +34,7 @@ from stad_study.study_probe import probe_study
 BRIEF = {"generations": 4, "max_frames": 30, "components": 8}
 CONFIG = Config.preset("quick", vae={"steps": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)
 VARIANTS = ("frame", "input_output")
-TINY = Study("a tiny one", (0, 1), VARIANTS, config=CONFIG, tracks=range(1000, 1018), max_frames=40)
+TINY = Study((0, 1), VARIANTS, config=CONFIG, tracks=range(1000, 1018), max_frames=40)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -189,7 +189,7 @@ def test_a_pipeline_repeated_by_name_is_bit_identical(made, tmp_path, capsys, mo
     shutil.copytree(made / "data", tmp_path / "data")
     tables.save("study_episodes", other, tmp_path / "data")
     found = study.compare(find_pipelines("tiny", [0])[2], tmp_path / "tiny", tmp_path / "data")
-    assert found.startswith("differs in  and 18 of 18 returns")
+    assert found.startswith("differs in 18 of 18 returns; recorded on ")
 
 
 def test_a_pipeline_that_is_killed_in_driving_continues_to_the_same_score(made, tmp_path):
@@ -207,12 +207,19 @@ def test_a_pipeline_that_is_killed_in_driving_continues_to_the_same_score(made, 
 
 
 def test_kept_agents_are_driven_on_any_tracks_by_one_command(made, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(evaluate_kept, "__defaults__", (None, None, made / "networks", None))
+    monkeypatch.setattr(evaluate_kept, "__defaults__", (None, None, made / "networks", None, ()))
     command = ["evaluate", "tiny", "--first-track", "5000", "--episodes", "2"]
     assert main([*command, "--only", "seed0/frame/z", "--json", str(tmp_path / "found.json")]) == 0
     assert capsys.readouterr().out.startswith("seed0/frame/z: mean return ")
     agents = load_json(tmp_path / "found.json")["agents"]
     assert [one["track"] for one in agents["seed0/frame/z"]["episodes"]] == [5000, 5001]
+    resumed = [*command, "--only", "seed0/frame/z", "seed0/frame/z_h"]
+    assert main([*resumed, "--json", str(tmp_path / "found.json")]) == 0
+    assert capsys.readouterr().out.count("mean return") == 1  # of the agent that was missing
+    assert set(load_json(tmp_path / "found.json")["agents"]) == {"seed0/frame/z", "seed0/frame/z_h"}
+    other = ["evaluate", "tiny", "--first-track", "5001", "--episodes", "2", "--only"]
+    assert main([*other, "seed0/frame/z", "--json", str(tmp_path / "found.json")]) == 2
+    assert "holds another study, or other tracks" in capsys.readouterr().err
     (tmp_path / "record.json").write_text("{}")
     assert main([*command, "--json", str(tmp_path / "record.json")]) == 2
     assert "name of a run's own file" in capsys.readouterr().err

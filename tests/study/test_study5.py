@@ -2,6 +2,8 @@
 
 import dataclasses
 import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -10,14 +12,15 @@ from stad_lab.agent import Agent, drive
 from stad_lab.config import Config
 from stad_lab.envs.cars import Cars
 from stad_lab.evaluation.trajectories import true_motion
-from stad_lab.io.files import load_json, load_tensors
+from stad_lab.io.files import copy_file, load_json, load_tensors
 from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_vae, save_mdn_rnn, save_vae
 from stad_lab.models.controller import parameter_count
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training.evolution import LOG
 from stad_lab.training.trainer import torch_settings
-from stad_study import senses, tables, world_facts
+from stad_study import senses, study5, tables, world_facts
+from stad_study.cli import main
 from stad_study.evolved import compare, find_runs, recorded, run_evolved
 from stad_study.networks import WORLD_MODEL_FILE, keep_world_model, load_kept_world_model
 from stad_study.senses import (
@@ -170,3 +173,40 @@ def test_an_unknown_run_or_seed_is_refused():
         find_runs(STUDY5, [12])
     with pytest.raises(ValueError, match="seed0/frame/y"):
         find_runs(STUDY5, only=["seed0/frame/y"])
+
+
+def test_a_world_that_is_not_kept_is_named_before_anything_drives(tmp_path, monkeypatch):
+    monkeypatch.setattr(study5, "prepare_seed", lambda *_: pytest.fail("drove"))
+    with pytest.raises(
+        FileNotFoundError, match=r"seed0/frame/world_model.safetensors is not there"
+    ):
+        run_evolved(STUDY5, tmp_path, [0], to=tmp_path / "data", networks=tmp_path)
+
+
+def test_of_two_processes_one_prepares_a_seed_and_the_other_waits(
+    made, networks, tmp_path, monkeypatch
+):
+    prepared = []
+
+    def prepare_seed(seed, folder, _):
+        prepared.append(seed)
+        time.sleep(0.3)
+        for variant in world_facts.SENSED_VARIANTS:
+            copy_file(made / f"study5/seed0/{variant}" / WORLD_FILE, folder / variant)
+
+    monkeypatch.setattr(study5, "prepare_seed", prepare_seed)
+    runs = find_runs(STUDY5)[:2]
+    with ThreadPoolExecutor(2) as both:
+        list(both.map(lambda run: study5.prepare(run, tmp_path, networks), runs))
+    assert prepared == [0]
+
+
+def test_the_pilot_of_the_erasure_is_one_command(capsys, monkeypatch):
+    monkeypatch.setattr(world_facts.measure_erasure, "__defaults__", (36, 2))
+    assert main(["erasure", "cropped_input_output"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    read, erased = (
+        next(one for one in lines if one[:2] == ["trained", "agent:"] and one[2:-4] == sees)
+        for sees in (["z"], ["z", "-", "motion"])
+    )
+    assert float(read[-3]) > 0.5 > 0.3 > float(erased[-3])  # R2 of the yaw rate

@@ -54,6 +54,5 @@ def test_a_hundred_stops_at_random_moments_by_every_signal_change_no_bit(quick_r
         for name in (VAE_FILE, MDN_RNN_FILE, CONTROLLER_FILE):
             assert (run / name).read_bytes() == (quick_run / name).read_bytes(), name
         generations = [load_json(one / LOG)["generations"] for one in (run, quick_run)]
-        for mine, whole in zip(*generations, strict=True):
-            assert {**mine, "seconds": 0} == {**whole, "seconds": 0}
+        assert generations[0] == generations[1]
         assert not [file for file in run.rglob("*") if file.suffix in (".tmp", ".part")]

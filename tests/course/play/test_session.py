@@ -6,7 +6,7 @@ import torch
 
 from stad_course.play.session import Hand, Session
 from stad_lab import load_agent
-from stad_lab.evaluation.trajectories import driven_path, record_trajectory
+from stad_lab.evaluation.trajectories import record_trajectory
 from stad_lab.features import remember_episode
 from stad_lab.models.mdn_rnn import to_state
 
@@ -120,7 +120,16 @@ def test_what_does_not_exist_is_refused(session):
         session.dream_trajectory()
 
 
-def test_dead_reckoning_follows_the_car(session):
+def driven_path(motion):
+    """The car's path by dead reckoning, from (0, 0) and upward: world units (T, 2)."""
+    forward, slip, yaw_rate = motion[:, :3].astype(float).T / 50
+    heading = np.cumsum(yaw_rate) - yaw_rate
+    east = slip * np.cos(heading) - forward * np.sin(heading)
+    north = slip * np.sin(heading) + forward * np.cos(heading)
+    return np.stack([np.cumsum(east) - east, np.cumsum(north) - north], axis=1)
+
+
+def test_dead_reckoning_from_the_recorded_motion_follows_the_car(session):
     racing = session.env.unwrapped
     start, angle = racing.position, float(racing.cars.cars["angle"][0, 0])
     drive(session, ("gas", 60), ("left", 40))
