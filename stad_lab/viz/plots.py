@@ -294,7 +294,9 @@ def plot_intervals(
     shifts = np.linspace(-0.25, 0.25, len(names)) if len(names) > 1 else [0]
     styles = dict(zip(names, zip(cycle("oDs^vP"), cycle(COLORS), shifts), strict=False))
     lines, width = -(-len(panels) // columns), 2.0 + 2.5 * columns if columns > 1 else 6.5
-    height = lines * (max(0.32, 0.11 * len(names)) * len(rows) + 0.75) + 0.7  # inches
+    singles = any(len(one) > 2 for series in contents for one in series.values())
+    row_height = max(0.32, 0.11 * len(names)) + 0.12 * singles  # inches
+    height = lines * (row_height * len(rows) + 0.75) + 0.7
     figure, axes = new_figure(width, height, lines, columns, sharex=True, sharey=True)
     lowest = -np.inf if limits is None else limits[0]
     # Nobody would listen to a longer alternative text.
@@ -307,8 +309,8 @@ def plot_intervals(
             y = place + (float(shift) if len(found[row]) > 1 else 0.0)
             outside = value < lowest
             x, mark = (lowest, "<") if outside else (value, mark)
-            lower = 0.18 * bool(single)  # the single values go below their mean
-            y -= lower / 2
+            lower = 0.11 * bool(single)  # the single values go below their mean
+            y -= lower
             axis.plot(interval, [y] * 2, color=color, lw=2, alpha=0.5)
             axis.plot(x, y, mark, color=color, ms=5, clip_on=not outside)
             for places in single:
