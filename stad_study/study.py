@@ -426,7 +426,9 @@ def read_driven(file: Path, study: str, tracks: Sequence[int]) -> dict[str, dict
 
     ValueError if it holds another study, or other tracks.
     """
-    known = load_json(file, kind="study") if file.exists() else {"study": study, "agents": {}}
+    if not file.exists():
+        return {}
+    known = load_json(file, kind="study")
     driven = [[one["track"] for one in own["episodes"]] for own in known["agents"].values()]
     if known["study"] != study or any(own != list(tracks) for own in driven):
         remedy = "give another file with --json"
