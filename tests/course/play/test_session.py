@@ -6,7 +6,7 @@ import torch
 
 from stad_course.play.session import Hand, Session
 from stad_lab import load_agent
-from stad_lab.evaluation.trajectories import record_trajectory
+from stad_lab.evaluation.trajectories import FRAMES_A_SECOND, record_trajectory
 from stad_lab.features import remember_episode
 from stad_lab.models.mdn_rnn import to_state
 
@@ -122,7 +122,7 @@ def test_what_does_not_exist_is_refused(session):
 
 def driven_path(motion):
     """The car's path by dead reckoning, from (0, 0) and upward: world units (T, 2)."""
-    forward, slip, yaw_rate = motion[:, :3].astype(float).T / 50
+    forward, slip, yaw_rate = motion[:, :3].astype(float).T / FRAMES_A_SECOND
     heading = np.cumsum(yaw_rate) - yaw_rate
     east = slip * np.cos(heading) - forward * np.sin(heading)
     north = slip * np.sin(heading) + forward * np.cos(heading)
