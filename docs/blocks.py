@@ -391,8 +391,27 @@ def commands_table(claims: dict) -> str:
     return "\n\n".join(parts)
 
 
+def faster_recipe(claims: dict) -> str:
+    """What study 6 says of the preset `fast`: how far it is, or its outcome."""
+    link, found = "[Study 6](protocol.md#study-6-a-faster-recipe)", claims["study6"]
+    if "not_worse" not in found:
+        runs, planned = (sum(found[name].values()) for name in ("pipelines", "planned"))
+        return (
+            "Whether the agents of `fast` drive as well as those of `laptop` is not decided yet: "
+            f"{runs} of {planned} runs of {link} are done."
+        )
+    outcome = "is" if found["not_worse"] else "is not"
+    return (
+        f"{link}: with `fast` in place of `laptop`, a loss of 30 points or more {outcome} ruled "
+        f"out. Over twelve pairs the mean difference is {found['difference']:+.1f} points, and its "
+        f"one-sided 95% bound {found['lower_bound']:+.1f}; from the means of six seeds the bound "
+        f"is {found['lower_bound_of_seeds']:+.1f}. V was of `frame` or `input_output`, and C saw z "
+        "and h."
+    )
+
+
 def settings_table(claims: dict) -> str:
-    """All settings, with the values of the three presets."""
+    """All settings, with the values of the presets."""
     values = [
         {name: str(value) for name, _, value in config.fields_of(preset)}
         for preset in config.PRESETS.values()
@@ -459,6 +478,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "study1": study1,
     "afterwards": afterwards,
     "outcomes": outcomes,
+    "faster recipe": faster_recipe,
     "turning": turning_table,
     "study3, agent": lambda claims: study3(claims, "agent"),
     "study3, random driver": lambda claims: study3(claims, "random_driver"),

@@ -26,7 +26,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from stad_lab.agent import Agent
-from stad_lab.config import STUDY_TRACKS, VARIANTS, Config
+from stad_lab.config import STUDY_TRACKS, VARIANTS, Config, flatten
 from stad_lab.evaluation.evaluate import report
 from stad_lab.io.files import (
     checksum,
@@ -301,6 +301,15 @@ def drive_tracks(
 def recorded(pipeline: Pipeline, to: Path = tables.DATA) -> dict | None:
     """The line of a pipeline in the table of runs; None if it is not there."""
     return tables.line_of("study_runs", pipeline, to)
+
+
+def check_settings(study: str, to: Path = tables.DATA) -> None:
+    """ValueError if a run in the table has another value than its recipe sets."""
+    for one in find_pipelines(study):
+        line = recorded(one, to) or {}
+        for name, value in flatten({"config": one.config.as_dict()}).items():
+            if line.get(name, value) != value:
+                raise ValueError(f"{study}/{one.name} has {name} {line[name]}, not {value}")
 
 
 def add_pipeline(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> None:

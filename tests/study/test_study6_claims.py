@@ -10,8 +10,11 @@ from stad_study.study import find_pipelines
 from stad_study.study6_claims import RECIPES, describe_study6
 
 
-def write_tables(folder, difference, without=None):
-    """The tables of all pipelines but one, which nobody has run; returns the scores by recipe."""
+def write_tables(folder, difference, without=None, wrong=()):
+    """The tables of all pipelines but one, which nobody has run; returns the scores by recipe.
+
+    `wrong` replaces values in the line of the last pipeline.
+    """
     rng, episodes, runs, scores = np.random.default_rng(0), [], [], {}
     for recipe, gain in zip(RECIPES, (0, difference), strict=True):
         for one in find_pipelines(recipe):
@@ -20,8 +23,10 @@ def write_tables(folder, difference, without=None):
             if (recipe, one.name) != without:
                 lines = {"track": range(1000, 1400), "return": returns, "length": 1000}
                 episodes.append(pandas.DataFrame(lines).assign(**one._asdict()))
-                made = {"world_model.trained_on": "cpu", "processor": "p", "dataset": "d"}
-                runs.append(one._asdict() | made | {"kept_controller": "c"})
+                made = {"world_model.trained_on": "cpu", "processor": "p", "kept_controller": "c"}
+                made |= {"dataset": f"d{one.seed}", "config.vae.steps": one.config.vae.steps}
+                runs.append(one._asdict() | made)
+    runs[-1] |= dict(wrong)
     tables.save("study_episodes", pandas.concat(episodes), folder)
     tables.save("study_runs", pandas.DataFrame(runs), folder)
     return scores
@@ -44,3 +49,28 @@ def test_the_bound_is_that_of_a_one_sided_paired_t_test(tmp_path, difference, no
     assert found["difference"] == pytest.approx(np.mean(pairs))
     assert found["lower_bound"] == pytest.approx(test.confidence_interval(0.95).low)
     assert found["not_worse"] is not_worse
+    by_seed = np.mean([pairs[::2], pairs[1::2]], axis=0)  # find_pipelines gives both variants
+    low = stats.ttest_1samp(by_seed, 0, alternative="greater").confidence_interval(0.95).low
+    assert found["lower_bound_of_seeds"] == pytest.approx(low)
+
+
+def test_a_bound_of_exactly_the_margin_is_not_enough(tmp_path):
+    write_tables(tmp_path, 0)
+    table = tables.read("study_episodes", tmp_path)
+    table["return"] = np.where(table["study"] == RECIPES[0], 850, 820)
+    tables.save("study_episodes", table, tmp_path)
+    assert describe_study6(tmp_path)["lower_bound"] == -30
+    assert describe_study6(tmp_path)["not_worse"] is False
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"config.vae.steps": 5000}, "study6_fast/seed205/input_output/z_h has config.vae.steps"),
+        ({"dataset": "d204"}, "seed 205 of study 6 has 2 datasets"),
+    ],
+)
+def test_runs_that_are_not_a_pair_are_refused(tmp_path, wrong, message):
+    write_tables(tmp_path, 0, wrong=wrong)
+    with pytest.raises(ValueError, match=message):
+        describe_study6(tmp_path)
