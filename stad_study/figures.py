@@ -124,20 +124,11 @@ def plot_learning_curves(curves: dict[str, dict]) -> Figure:
     return describe(figure, title, "At the end: ", ends)
 
 
-def plot_representation(study3: dict, driver: str = "agent") -> Figure:
-    """R2 of the probe over all V networks of study 1, and of untrained ones, by quantity.
-
-    Args:
-        study3: "DRIVER: VARIANT" -> features -> quantity -> "mean", "interval" and "values".
-        driver: "agent" or "random_driver".
-    """
-    panels = representation(study3, driver)
-    title = f"Study 3: what {study3['networks']} V networks and untrained ones carry, a line each"
-    return plot_probe(panels, f"{title} ({DRIVERS[driver]} drives)")
-
-
 def plot_drivers(study3: dict) -> Figure:
-    """What a single frame does not show, with both drivers: `plot_representation` side by side."""
+    """R2 of what a single frame does not show, for all V networks of study 1, with both drivers.
+
+    study3: "DRIVER: VARIANT" -> features -> quantity -> "mean", "interval" and "values".
+    """
     panels = {
         f"{quantity}, {name} drives": representation(study3, driver)[quantity]
         for driver, name in DRIVERS.items()

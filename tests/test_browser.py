@@ -160,30 +160,10 @@ explore_latents(agent.vae, np.zeros(32, np.float32))
 )
 
 
-SOURCE = """
-from stad_lab.envs.frames import FrameMemory
-from stad_lab.viz.widgets import show_source
-show_source(FrameMemory)
-"""
-LIGHTS = r"""pre => {
-    const inked = Array.from(pre.querySelectorAll("span")).filter(part => part.textContent.trim())
-    const inks = inked.map(part => getComputedStyle(part).color)
-    const colors = [getComputedStyle(pre).backgroundColor, ...inks]
-    return colors.map(color => color.match(/[0-9]+/g).slice(0, 3).map(Number))
-}"""
-
-
-def test_source_is_readable_in_the_dark_theme_and_a_slider_changes_every_figure(run):
-    page = run(SOURCE, *SLIDERS)  # one page for both: a kernel takes seconds to start
+def test_a_slider_changes_every_figure(run):
+    page = run(*SLIDERS)  # one page for both: a kernel takes seconds to start
     cells = page.locator(".jp-CodeCell")
-    paper, *inks = cells.first.locator(".jp-OutputArea-output pre").last.evaluate(
-        LIGHTS, timeout=1000 * SLOW
-    )
-    assert page.locator("body").get_attribute("data-jp-theme-light") == "false"
-    assert min(paper) > 240 and len(inks) > 20
-    assert max(sum(ink) / 3 for ink in inks) < 175
-
-    for number, pictures, sliders in ((1, 1, 1), (2, 2, 32)):
+    for number, pictures, sliders in ((0, 1, 1), (1, 2, 32)):
         cell = cells.nth(number)
         handles = cell.locator(".noUi-handle")
         handles.first.wait_for(timeout=1000 * SLOW)

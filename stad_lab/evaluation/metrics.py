@@ -269,15 +269,14 @@ def two_peaks(logpi: np.ndarray, mean: np.ndarray, logsigma: np.ndarray) -> np.n
     return found.reshape(*shape, 3)
 
 
-def clearest_case(peaks: np.ndarray, came: np.ndarray) -> tuple[tuple[int, ...], np.ndarray]:
-    """The deepest valley between two peaks of which one came true.
+def clearest_case(peaks: np.ndarray, came: np.ndarray) -> tuple[int, ...]:
+    """The place of the deepest valley between two peaks of which one came true.
+
+    A peak comes true if the value lies within a quarter of their distance.
 
     Args:
         peaks: (..., 3), as `two_peaks` returns them.
         came: what came, (...).
-
-    Returns:
-        Its place; and bool (...), where a peak came true: within a quarter of their distance.
 
     Raises:
         ValueError: nowhere did a peak come true.
@@ -290,4 +289,4 @@ def clearest_case(peaks: np.ndarray, came: np.ndarray) -> tuple[tuple[int, ...],
             f"expected a density with two peaks that came true, got none of {rise.size}"
         )
     place = np.unravel_index(np.where(true, rise, 0).argmax(), rise.shape)
-    return tuple(int(index) for index in place), true
+    return tuple(int(index) for index in place)

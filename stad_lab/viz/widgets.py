@@ -3,7 +3,6 @@
 import base64
 import contextlib
 import html
-import inspect
 import io
 import signal
 import threading
@@ -14,13 +13,10 @@ import numpy as np
 import torch
 from IPython.display import HTML, DisplayHandle
 from matplotlib.figure import Figure
-from pygments import highlight
-from pygments.formatters import HtmlFormatter
-from pygments.lexers import PythonLexer
 
 from stad_lab.models.vae import VAE, to_array, to_uint8
 from stad_lab.training.evolution import Watch
-from stad_lab.viz.plots import BLUE, difference_colors, to_png
+from stad_lab.viz.plots import difference_colors, to_png
 from stad_lab.viz.video import enlarged
 
 
@@ -41,17 +37,6 @@ def show_picture(content: bytes, kind: str, alt: str) -> HTML:
         raise ValueError(f"alt={alt!r}: expected a text; a figure has one after set_label")
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
     return HTML(f'<img src="{source}" alt="{html.escape(alt)}" style="background: white">')
-
-
-def show_source(*things: Callable) -> HTML:
-    """The source code of functions or classes, as it runs, in colour."""
-    source = "\n\n".join(inspect.getsource(thing).rstrip() for thing in things)
-    # Its own colours: a dark theme would put a dark background under dark letters.
-    colors = "background: #f8f8f8; color: black"
-    box = f"{colors}; padding: 4px 10px; border-left: 3px solid {BLUE}"
-    letters = f"{colors}; font-family: monospace"
-    page = HtmlFormatter(noclasses=True, cssstyles=box, prestyles=letters)
-    return HTML(highlight(source, PythonLexer(), page))
 
 
 def explore(draw: Callable[..., Figure], **controls: ipywidgets.Widget) -> ipywidgets.VBox:

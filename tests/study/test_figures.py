@@ -12,7 +12,6 @@ from stad_study.figures import (
     plot_drivers,
     plot_learning_curves,
     plot_primary,
-    plot_representation,
     plot_scores,
     plot_study,
 )
@@ -71,24 +70,13 @@ def test_every_pipeline_has_its_score():
     assert "C sees z and h: frame 820" in figure.get_label()
 
 
-def test_every_network_has_its_line():
-    one = {"mean": 0.5, "interval": [0.4, 0.6], "values": [0.4, 0.5, 0.6]}
-    found = {features: dict.fromkeys(MOTION, one) for features in FEATURES}
-    names = [*VARIANTS, "frame, untrained"]
-    study3 = {"networks": 12} | {f"agent: {name}": found for name in names}
-    study3 |= {"random_driver: frame": found}
-    figure = plot_representation(study3)
-    assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == names
-    marks = [line for line in figure.axes[2].lines if line.get_marker() == "|"]
-    assert len(marks) == 2 * 5 and all(np.size(line.get_xdata()) == 3 for line in marks)
-    assert "12 V networks" in figure.get_label() and "yaw rate of input 0.50" in figure.get_label()
-
-
-def test_both_drivers_stand_below_each_other():
+def test_every_network_has_its_line_and_both_drivers_stand_below_each_other():
     one = {"mean": 0.5, "interval": [0.4, 0.6], "values": [0.4, 0.5, 0.6]}
     found = {features: dict.fromkeys(MOTION, one) for features in FEATURES}
     study3 = {f"{driver}: {name}": found for driver in DRIVERS for name in VARIANTS}
     figure = plot_drivers(study3 | {"networks": 12})
+    marks = [line for line in figure.axes[1].lines if line.get_marker() == "|"]
+    assert len(marks) == 2 * 4 and all(np.size(line.get_xdata()) == 3 for line in marks)
     titles = [axis.get_title() for axis in figure.axes]
     assert titles[1] == "yaw rate, an agent drives"
     assert titles[4] == "yaw rate, the random driver drives"
