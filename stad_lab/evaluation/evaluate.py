@@ -67,11 +67,8 @@ def evaluate(
     # Of V and M as they are loaded: a shipped agent's may be of lower precision.
     weights = {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
     asked = {**identity, "tracks": tracks, **weights}
-    known = {}
-    if unfinished and unfinished.exists():
-        known = load_json(unfinished, "evaluate again", kind=UNFINISHED)
-    driven = known["driven"] if known.get("asked") == asked else {}
-    begin = time.perf_counter() - (known["seconds"] if driven else 0)
+    driven, seconds = read_unfinished(unfinished, asked)
+    begin = time.perf_counter() - seconds
     missing = [track for track in tracks if str(track) not in driven]
     workers = worker_threads if fast else worker_processes
     with workers(processes, executor) as executor:
@@ -83,19 +80,30 @@ def evaluate(
         for number, (returns, lengths) in tqdm(results, f"evaluate ({agent.vae.variant})", **shown):
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
-                now = {
-                    "kind": UNFINISHED,
-                    "asked": asked,
-                    "driven": driven,
-                    "seconds": time.perf_counter() - begin,
-                }
-                with suppress(OSError):  # with a full disk it goes on, but cannot be resumed
-                    save_json(unfinished, now)
+                write_unfinished(unfinished, asked, driven, time.perf_counter() - begin)
     returns, lengths = zip(*(driven[str(track)] for track in tracks), strict=True)
     result = report(tracks, np.array(returns), np.array(lengths))
     seconds, command = time.perf_counter() - begin, f"python -m stad_lab evaluate --agent {source}"
     made_with = provenance(f"{command} --episodes {episodes} --first-track {first_track}")
     return {"kind": KIND, **identity, **result, "seconds": seconds, "made_with": made_with}
+
+
+def read_unfinished(file: Path | None, asked: dict) -> tuple[dict, float]:
+    """What an interrupted evaluation has driven, track -> (return, frames), and its seconds.
+
+    Both are empty if there is no such file, or if it asked for another agent or other tracks.
+    """
+    known = {}
+    if file and file.exists():
+        known = load_json(file, "evaluate again", kind=UNFINISHED)
+    return (known["driven"], known["seconds"]) if known.get("asked") == asked else ({}, 0.0)
+
+
+def write_unfinished(file: Path, asked: dict, driven: dict, seconds: float) -> None:
+    """Keep what was driven; with a full disk the evaluation goes on, but cannot be resumed."""
+    now = {"kind": UNFINISHED, "asked": asked, "driven": driven, "seconds": seconds}
+    with suppress(OSError):
+        save_json(file, now)
 
 
 def check_tracks(episodes: int, first_track: int) -> None:
