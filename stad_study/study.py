@@ -303,10 +303,10 @@ def recorded(pipeline: Pipeline, to: Path = tables.DATA) -> dict | None:
     return tables.line_of("study_runs", pipeline, to)
 
 
-def check_settings(study: str, to: Path = tables.DATA) -> None:
-    """ValueError if a run in the table has another value than its recipe sets."""
-    for one in find_pipelines(study):
-        line = recorded(one, to) or {}
+def check_settings(study: str, runs: pandas.DataFrame) -> None:
+    """ValueError if a run in the table of runs has another value than its recipe sets."""
+    for line in runs[runs["study"] == study].to_dict("records"):
+        one = Pipeline(*(line[key] for key in PIPELINE))
         for name, value in flatten({"config": one.config.as_dict()}).items():
             if line.get(name, value) != value:
                 raise ValueError(f"{study}/{one.name} has {name} {line[name]}, not {value}")

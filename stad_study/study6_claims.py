@@ -24,7 +24,7 @@ def describe_study6(folder: Path = tables.DATA) -> dict:
     """
     runs = tables.read_study("runs", folder)
     for name in RECIPES:
-        check_settings(name, folder)
+        check_settings(name, runs)
     check_datasets(runs[runs["study"].isin(RECIPES)])
     progress = {
         name: describe_progress(STUDIES[name], runs[runs["study"] == name]) for name in RECIPES

@@ -79,8 +79,9 @@ def test_a_study_runs_whole_seeds_in_order():
 
 
 def test_the_settings_of_a_study_are_those_that_its_runs_recorded():
+    runs = tables.read_study("runs")
     for name in STUDIES:
-        study.check_settings(name)
+        study.check_settings(name, runs)
 
 
 def test_training_and_validation_never_drive_the_tracks_of_a_score():
