@@ -72,9 +72,9 @@ class Report:
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        """The summary, and a table that is open if a line asks for something to be done.
+        """The summary, and a table that is open if a line is red.
 
-        An extra that is not complete asks for nothing. Text and background are the page's.
+        Text and background are the page's.
         """
         rows = ""
         for line in self.lines:
@@ -82,8 +82,7 @@ class Report:
             mark = f'<span style="color: {COLORS[line.state]}">&#9679;</span> {line.state}'
             cells = (mark, escape(line.name), escape(line.found) + remedy)
             rows += "".join(["<tr>", *(f'<td align="left">{cell}</td>' for cell in cells), "</tr>"])
-        quiet = all(line.state == GREEN or line.name.startswith("extra ") for line in self.lines)
-        opened = "" if quiet else " open"
+        opened = "" if self.ok else " open"
         summary = f"<summary>{escape(self.summary)}</summary>"
         return f"<details{opened}>{summary}<table>{rows}</table></details>"
 

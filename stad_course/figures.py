@@ -73,6 +73,10 @@ def plot_mixture(
         axis.plot(z, gaussians @ weights, dash, color=color, lw=2, label=label)
         if len(temperatures) == 1:
             axis.plot(z, weights * gaussians, **THIN)
+            center = weights @ mean
+            spread = np.sqrt(weights @ (sigma**2 + (mean - center) ** 2))
+            one = np.exp(-0.5 * ((z - center) / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
+            axis.plot(z, one, "-.", color=ORANGE, lw=1.5, label="one Gaussian")
     if actual is not None:
         axis.axvline(actual, color=RED, ls="--", lw=1.5, label="actual value")
     axis.set(xlabel="next value of the latent", ylabel="probability density", ylim=(0, None))
@@ -166,7 +170,7 @@ def plot_ranks(ranks: dict[str, np.ndarray], title: str) -> Figure:
     label = "who won on the first"
     axis.plot(table[:, winner], "o-", color=ORANGE, lw=2.5, ms=7, label=label)
     axis.set(xticks=range(len(ranks)), xticklabels=list(ranks), ylabel="rank (1: the best)")
-    axis.set_ylim(table.max() + 1, 0)
+    axis.set(ylim=(table.max() + 0.7, 0.3), yticks=[1, *range(4, table.max() + 1, 4)])
     legend_below(figure, axis)
     places = [f"{name} rank {own[winner]}" for name, own in ranks.items()]
     return describe(figure, title, "The winner of the first: ", places)

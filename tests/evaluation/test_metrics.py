@@ -200,7 +200,7 @@ def test_two_peaks_are_found_with_the_valley_between_them_and_one_peak_is_not():
 
 def test_the_clearest_case_is_the_deepest_valley_of_which_a_peak_came_true():
     peaks = np.array([[0.9, -1.0, 1.0], [0.5, -1.0, 1.0], [0.0, 0.0, 0.0], [0.4, 0.0, 4.0]])
-    assert clearest_case(peaks, np.array([0.1, 0.8, 0.0, 4.5])) == (1,)
+    assert clearest_case(peaks, np.array([0.1, 1.2, 0.0, 4.5])) == (1,)
     with pytest.raises(ValueError, match="got none of 4"):
         clearest_case(peaks, np.array([0.1, 0.0, 0.0, 2.0]))
 
