@@ -338,7 +338,8 @@ PRESETS = {
         ),
     ),
     # Trains V on a quarter of the pictures of `laptop`, and M on a third of the sequences, in small
-    # batches, of which a CPU learns more in the same time; study 6 of docs/protocol.md.
+    # batches, of which a CPU learns more in the same time. Study 6 of docs/protocol.md could not
+    # rule out that it costs 30 points.
     "fast": Config(
         vae=VAEConfig(steps=5500, batch=32),
         mdn_rnn=MDNRNNConfig(steps=2000, batch=16, learning_rate=1.5e-3),

@@ -17,7 +17,8 @@ RECIPES = "study6_laptop", "study6_fast"
 
 
 def describe_study6(folder: Path = tables.DATA) -> dict:
-    """Progress by recipe; and after the last pipeline scores, difference, bound and "not_worse".
+    """Progress by recipe; and after the last pipeline scores, difference, standard deviation, bound
+    and "not_worse".
 
     "lower_bound_of_seeds" takes the mean of both variants of a seed as one value; it is described.
     ValueError if a run has other settings than its recipe, or a pair two datasets.
@@ -42,6 +43,7 @@ def describe_study6(folder: Path = tables.DATA) -> dict:
     return found | {
         "scores": {name: own.tolist() for name, own in scores.items()},
         "difference": float(differences.mean()),
+        "deviation": float(differences.std(ddof=1)),
         "lower_bound": bound,
         "lower_bound_of_seeds": mean_interval(by_seed, outside=0.1)[0],
         "not_worse": bound > -MARGIN,

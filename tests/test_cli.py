@@ -174,9 +174,10 @@ def test_a_record_without_a_field_that_was_added_later_is_continued(run):
     assert call(*train_quickly(run)) == 0
 
 
-def test_the_command_in_a_record_asks_for_the_configuration_of_that_record(monkeypatch):
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_command_in_a_record_asks_for_the_configuration_of_that_record(monkeypatch, preset):
     changes = {"data": {"crop_bar": False}, "vae": {"stride": 2}, "evolution": {"features": "z"}}
-    config = Config.preset("laptop", variant="input", **changes)
+    config = Config.preset(preset, variant="input", **changes)
     found = []
     monkeypatch.setattr(
         "stad_lab.training.pipeline.train", lambda *given: found.append(given[0]) or True

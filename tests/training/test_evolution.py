@@ -386,12 +386,12 @@ def test_an_evolution_runs_on_one_thread_where_there_are_more(quick_run, tmp_pat
 
 
 def test_a_replay_gives_the_logged_means_with_any_number_of_threads():
-    start, laptop, log = initial_parameters(32, 256), Config().evolution, {"random": RANDOM}
+    start, settings, log = initial_parameters(32, 256), Config().evolution, {"random": RANDOM}
     with threadpool_limits(1):
-        strategy = make_strategy(start, laptop, RANDOM)
-        log["generations"] = simulate(strategy, laptop, 14)
+        strategy = make_strategy(start, settings, RANDOM)
+        log["generations"] = simulate(strategy, settings, 14)
     with threadpool_limits(2):
-        assert np.array_equal(replay(start, laptop, log)[1][-1], strategy.mean)
+        assert np.array_equal(replay(start, settings, log)[1][-1], strategy.mean)
 
 
 @pytest.mark.parametrize("rule", ["CSA", "TPA"])
