@@ -8,7 +8,6 @@ from scipy import stats
 SOLVED = 900  # points; CarRacing counts as solved at a mean return of 900 over 100 tracks
 FAILED = 800  # points; an episode below has left the road or missed tiles
 RESAMPLES = 10_000  # of a bootstrap
-CHUNK = 100  # resamples that are in memory together
 
 
 def summarise(returns: np.ndarray) -> dict:
@@ -39,11 +38,17 @@ def bootstrap(returns: np.ndarray, resamples: int = RESAMPLES) -> list[float]:
     five. With one seed it holds the variance between tracks alone.
     """
     rng, (seeds, tracks) = np.random.default_rng(0), returns.shape
-    columns = rng.integers(tracks, size=(resamples, 1, tracks))
-    rows = rng.integers(seeds, size=(resamples, seeds, 1))
-    parts = [slice(start, start + CHUNK) for start in range(0, resamples, CHUNK)]
-    means = [returns[rows[own], columns[own]].mean(axis=(1, 2)) for own in parts]
-    return [float(bound) for bound in np.percentile(np.concatenate(means), [2.5, 97.5])]
+    columns = count_draws(rng.integers(tracks, size=(resamples, tracks)), tracks)
+    rows = count_draws(rng.integers(seeds, size=(resamples, seeds)), seeds)
+    means = ((rows @ returns) * columns).sum(axis=1) / returns.size
+    return [float(bound) for bound in np.percentile(means, [2.5, 97.5])]
+
+
+def count_draws(drawn: np.ndarray, count: int) -> np.ndarray:
+    """How often each of 0 to count - 1 is in each row of (rows, draws): float64 (rows, count)."""
+    cells = drawn + count * np.arange(len(drawn))[:, None]
+    found = np.bincount(cells.ravel(), minlength=count * len(drawn))
+    return found.reshape(-1, count).astype(np.float64)
 
 
 def paired_p(differences: Sequence[float] | np.ndarray) -> float:
