@@ -293,7 +293,13 @@ def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     assert long <= folded
     texts = ["".join(cell["source"]) for cell in cells_of(file) if cell["cell_type"] == "markdown"]
     assert sum(len(text.split()) for text in texts) <= most
-    assert "check_environment()" in next(iter(code.values()))
+
+
+def test_the_first_lesson_alone_checks_the_environment():
+    checks = [
+        one.stem for one in NOTEBOOKS if "check_environment()" in "".join(code_of(one).values())
+    ]
+    assert checks == ["00_first_drive"]
 
 
 def names_in(source):
