@@ -122,6 +122,7 @@ def plot_cma_es(
     landscape: Callable[[np.ndarray], np.ndarray],
     generations: list[dict],
     shown: list[int],
+    title: str = "Population (dots), mean (cross) and one-sigma ellipse",
 ) -> Figure:
     """CMA-ES on a function of two variables: population and one-sigma ellipse of generations.
 
@@ -149,7 +150,6 @@ def plot_cma_es(
         axis.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
         caption(axis, f"generation {index + 1}", "x")
     axes[0, 0].set_ylabel("y")
-    title = "Population (dots), mean (cross) and one-sigma ellipse"
     describe(figure, title, "Generations ", (str(index + 1) for index in shown))
     if len(shown) < 3:
         figure.suptitle("Population, mean, ellipse", fontsize=11)  # for a narrow figure
