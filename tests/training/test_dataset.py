@@ -28,7 +28,7 @@ from stad_lab.training.dataset import (
 
 QUICK = Config.preset("quick")
 # A second of driving at least, so that an interrupt comes in the middle.
-MANY = {"episodes": 40, "episode_frames": 30}
+MANY = {"episodes": 120, "episode_frames": 30}  # some seconds: time for an interrupt
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def contents(folder):
 
 def collect_command(folder):
     """The arguments that collect the same episodes as `uninterrupted`, with two processes."""
-    changes = ["--data.episodes", "40", "--data.episode-frames", "30"]
+    changes = ["--data.episodes", "120", "--data.episode-frames", "30"]
     return ["train", "quick", "--until", "dataset", "--out", str(folder), *changes]
 
 
