@@ -68,14 +68,14 @@ def plot_mixture(
         weights = np.exp((logpi - logpi.max()) / temperature)
         weights /= weights.sum()
         sigma = np.exp(logsigma) * np.sqrt(temperature)
-        gaussians = np.exp(-0.5 * ((z[:, None] - mean) / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
+        gaussians = gaussian(z[:, None], mean, sigma)
         label = f"temperature {temperature:g}"
         axis.plot(z, gaussians @ weights, dash, color=color, lw=2, label=label)
         if len(temperatures) == 1:
             axis.plot(z, weights * gaussians, **THIN)
             center = weights @ mean
             spread = np.sqrt(weights @ (sigma**2 + (mean - center) ** 2))
-            one = np.exp(-0.5 * ((z - center) / spread) ** 2) / (np.sqrt(2 * np.pi) * spread)
+            one = gaussian(z, center, spread)
             axis.plot(z, one, "-.", color=ORANGE, lw=1.5, label="one Gaussian")
     if actual is not None:
         axis.axvline(actual, color=RED, ls="--", lw=1.5, label="actual value")
@@ -83,6 +83,11 @@ def plot_mixture(
     axis.legend(frameon=False)
     lead, chosen = "Density of the mixture at temperature ", (f"{one:g}" for one in temperatures)
     return describe(figure, "M's prediction for one latent", lead, chosen)
+
+
+def gaussian(z: np.ndarray, mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """The density of normal distributions at z; the arrays are broadcast together."""
+    return np.exp(-0.5 * ((z - mean) / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
 
 
 def plot_dream(
