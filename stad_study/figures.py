@@ -5,11 +5,10 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from stad_lab.config import VARIANTS
 from stad_lab.viz.plots import (
-    BLUE,
+    COLORS,
     DASHES,
-    GREEN,
-    RED,
     caption,
     describe,
     legend_below,
@@ -18,7 +17,7 @@ from stad_lab.viz.plots import (
     plot_intervals,
 )
 
-COLOURS = {"frame": "#555555", "input": BLUE, "output": RED, "input_output": GREEN}
+COLOURS = dict(zip(VARIANTS, COLORS, strict=False))  # those of the rows of `plot_returns`
 SEEN = {"z, h": "C sees z and h", "z": "C sees z"}
 DRIVERS = {"agent": "an agent", "random_driver": "the random driver"}
 SOURCES = {"z": "z", "z, h": "z and h"}
