@@ -1,5 +1,6 @@
 """Drives seen from above: where each car of a batch went, what it scored, and figures of it."""
 
+from collections.abc import Iterable
 from itertools import chain
 from typing import NamedTuple
 
@@ -7,10 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stad_lab.agent import rollout
+from stad_lab.agent import Agent, rollout
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.statistics import SOLVED
+from stad_lab.evaluation.trajectories import Recorder, Trajectory
 from stad_lab.io.weights import WorldModel
 from stad_lab.io.workers import run_in_order, single_thread, worker_threads
 from stad_lab.training.evolution import make_agent
@@ -82,7 +84,49 @@ def drive_group(
     return Drives(episodes.returns, [np.array(path) for path in paths], roads)
 
 
+class Watched(NamedTuple):
+    """One episode of an agent, with where it went."""
+
+    trajectory: Trajectory
+    path: np.ndarray  # position in every frame, world units (T, 2)
+    road: np.ndarray  # centres of the track's tiles, world units (tiles, 2)
+
+
+def watch(agent: Agent, track: int) -> Watched:
+    """Let an agent drive an episode of at most 1,000 frames, and note where it is."""
+    cars, path = Cars(1), []
+    cars.reset([track])
+    recorder = Recorder(cars)
+
+    def note(which: np.ndarray, seen: np.ndarray, actions: np.ndarray) -> None:
+        recorder(which, seen, actions)
+        path.append(cars.cars["position"][0, 0].astype(float))
+
+    episodes = rollout(agent, cars, max_frames=1000, observe=note)
+    road = cars.tracks[0].path[:, 2:]
+    return Watched(recorder.trajectory(episodes.rewards[0]), np.array(path), road)
+
+
+def sharpest_bends(tracks: Iterable[int], tiles: int = 20) -> tuple[np.ndarray, np.ndarray]:
+    """The sharpest bend of each track over so many tiles, to the left and to the right.
+
+    Returns:
+        How far it turns, degrees, float64 (tracks, 2), and the tile where it begins, int64
+        (tracks, 2).
+    """
+    cars, degrees, begins = Cars(1), [], []
+    for track in tracks:
+        cars.reset([track])
+        heading = np.unwrap(cars.tracks[0].path[:, 1])
+        turned = heading[tiles:] - heading[:-tiles]  # radians to the left
+        degrees.append(np.degrees([turned.max(), -turned.min()]))
+        begins.append([turned.argmax(), turned.argmin()])
+    return np.array(degrees), np.array(begins)
+
+
 # Figures
+
+ARROWS = 120  # frames between the arrows of a path
 
 
 def plot_paths(
@@ -134,8 +178,12 @@ def plot_road(
         for (name, path), (color, dash) in zip(paths.items(), STYLES, strict=False):
             axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
             axis.plot(*path[-1], "x", color=color, ms=7)
+            for tail, head in zip(path[:-5:ARROWS], path[5::ARROWS], strict=False):
+                arrow = {"arrowstyle": "-|>", "color": color}
+                axis.annotate("", head, tail, arrowprops=arrow, annotation_clip=True)
+        axis.plot(*road[0], "^", color="black", ms=7)
         axis.set(xlabel="world units", aspect="equal")
-    axes[0, 0].set(ylabel="world units", title="the lap (x: end of an episode)")
+    axes[0, 0].set(ylabel="world units", title="the lap (triangle: start, x: end)")
     (x, y), far = road[center], np.array([-reach, reach])
     axes[0, 1].set(xlim=x + far, ylim=y + far, title=f"around tile {center}")
     axes[0, 1].legend(fontsize=8)

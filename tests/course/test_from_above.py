@@ -6,6 +6,7 @@ import pytest
 from stad_course import from_above
 from stad_course.from_above import plot_learning, plot_maps, plot_road
 from stad_lab.agent import drive, load_agent
+from stad_lab.envs.cars import Cars
 from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.training.evolution import make_agent
 
@@ -44,3 +45,23 @@ def test_a_road_has_its_true_width_and_is_enlarged_around_its_tile():
         [figure.axes[1].get_xlim(), figure.axes[1].get_ylim()], [[-30, 30], [70, 130]]
     )
     assert "200 tiles" in figure.get_label() and "one, two" in figure.get_label()
+
+
+def test_the_sharpest_bends_are_where_the_road_turns_most():
+    degrees, begins = from_above.sharpest_bends([3, 4])
+    cars = Cars(1)
+    cars.reset([4])
+    heading = np.degrees(np.unwrap(cars.tracks[0].path[:, 1]))
+    left, right = begins[1]
+    assert degrees[1, 0] == pytest.approx(heading[left + 20] - heading[left])
+    assert degrees[1, 1] == pytest.approx(heading[right] - heading[right + 20])
+    assert (degrees[:, 0] > degrees[:, 1]).all()  # laps run anticlockwise
+
+
+def test_a_watched_episode_has_a_position_for_every_frame():
+    agent = load_agent("cropped_input")
+    one = from_above.watch(agent, 3)
+    assert len(one.path) == len(one.trajectory) == len(one.trajectory.motion)
+    moved = np.linalg.norm(np.diff(one.path, axis=0), axis=1)
+    speed = np.linalg.norm(one.trajectory.motion[:, :2], axis=1)
+    assert np.corrcoef(moved, speed[1:])[0, 1] > 0.95
