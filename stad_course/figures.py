@@ -9,7 +9,6 @@ from matplotlib.patches import Ellipse
 
 from stad_lab.viz.plots import (
     BLUE,
-    COLORS,
     ORANGE,
     RED,
     SKY,
@@ -24,17 +23,14 @@ from stad_lab.viz.plots import (
 )
 
 
-def plot_speed(speed: np.ndarray, change: dict[int, np.ndarray]) -> Figure:
-    """The car's speed at the end of every episode, and for each stride the mean `|d|` there."""
+def plot_speed(speeds: np.ndarray, changes: np.ndarray) -> Figure:
+    """The mean `|d|` at each speed (speeds,), a line for each place: changes (places, speeds)."""
     figure, ((axis,),) = new_figure(6.5, 3.6)
-    for (stride, values), color in zip(change.items(), cycle(COLORS), strict=False):
-        label = f"stride {stride}: correlation {np.corrcoef(speed, values)[0, 1]:.2f}"
-        axis.scatter(speed, values, s=8, color=color, alpha=0.6, label=label)
+    axis.plot(speeds, changes.T, ".-", color=BLUE, lw=1, alpha=0.6)
     axis.set(xlabel="true speed (world units per second)", ylabel="mean |d| of the frame")
-    axis.legend(frameon=False)
-    title = "The difference image grows with speed, and with the stride"
-    lead = "One point for every episode and stride; strides "
-    return describe(figure, title, lead, map(str, change))
+    lead = f"{len(changes)} lines; at the highest speed from "
+    ends = f"{changes[:, -1].min():.3f} to {changes[:, -1].max():.3f}"
+    return describe(figure, "How much the picture changes: a line is one place", lead, [ends])
 
 
 def plot_rate_distortion(
@@ -45,6 +41,7 @@ def plot_rate_distortion(
     axis.plot(rates, errors, "o-", color=BLUE)
     axis.set(xlabel="rate: KL (nats)", ylabel="distortion: squared error")
     axis.margins(0.18)
+    axis.set_xlim(left=-0.02 * rates.max())
     values = []
     for name, rate, error in zip(names, rates, errors, strict=True):
         place = {"xytext": (6, 6), "textcoords": "offset points"}
