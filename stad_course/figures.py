@@ -102,7 +102,7 @@ def plot_dream(
         moment: the frame to show, from 0.
         name: of the dream.
         steps: of `errors`, 1 for the first dreamed frame.
-        errors: name -> error at these steps, 1 for that of the best constant picture.
+        errors: name -> error at these steps, 1 for that of the average picture.
     """
     figure, axes = new_figure(9.4, 3.0, 1, 3, width_ratios=[1, 1, 1.7])
     for axis, picture, title in zip(axes[0], (real, dream), ("real", name), strict=False):
@@ -113,7 +113,7 @@ def plot_dream(
         axis.plot(steps, values, dash, color=color, label=way)
     axis.axhline(1, **THIN)
     axis.axvline(moment + 1, color="black", lw=1.5)
-    axis.set(xlabel="steps dreamed", ylabel="error (best constant = 1)", ylim=(0, None))
+    axis.set(xlabel="steps dreamed", ylabel="error (average picture = 1)", ylim=(0, None))
     axis.legend(**SMALL, loc="lower right")
     title = f"Step {moment + 1} of a dream ({(moment + 1) / 50:.1f} seconds)"
     now = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
