@@ -295,6 +295,14 @@ def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     assert sum(len(text.split()) for text in texts) <= most
 
 
+@pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
+def test_the_steps_of_a_notebook_are_numbered_without_a_gap(file):
+    texts = ["".join(cell["source"]) for cell in cells_of(file) if cell["cell_type"] == "markdown"]
+    steps = re.findall(r"^## Step (\d+)\. ", "\n".join(texts), re.M)
+    assert steps == [str(number) for number in range(1, len(steps) + 1)]
+    assert len(steps) >= 4
+
+
 def test_the_first_lesson_alone_checks_the_environment():
     checks = [
         one.stem for one in NOTEBOOKS if "check_environment()" in "".join(code_of(one).values())
