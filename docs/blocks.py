@@ -515,7 +515,6 @@ NUMBERS: dict[str, Callable[[dict], float]] = {
     "networks of a GPU": lambda claims: sum(
         count for name, count in claims["study1"]["trained_on"].items() if name != "cpu"
     ),
-    "probed seeds": lambda claims: claims["study3"]["seeds"],
     "probed networks": lambda claims: claims["study3"]["networks"],
     "verdicts that stay": lambda claims: stays(claims["study1"], "z, h"),
     "diagnostic verdicts that stay": lambda claims: stays(claims["study1"], "z"),

@@ -86,7 +86,8 @@ def make_experiments() -> dict[str, Experiment]:
     """All experiments by name."""
     found: dict[str, Experiment] = {}
     for name in VARIANTS:
-        paper = Config.preset("paper", variant=name, evolution={"step_size_rule": "TPA"})
+        early = {"step_size_rule": "TPA", "tracks": 1}
+        paper = Config.preset("paper", variant=name, evolution=early)
         no_bar = Config.preset("laptop", variant=name)
         first = no_bar.replace(data={"crop_bar": False}, evolution={"generations": 15})
         two = first.replace(**SECOND_ITERATION)
