@@ -36,6 +36,7 @@ EARLY_RECIPE = {
         "components": 0, "sigma_decay": 0.0, "step_size_rule": "TPA",
     },
 }  # fmt: skip
+EARLY_PAPER = {"evolution": {"step_size_rule": "TPA", "tracks": 1}}
 # Single changes of "one_iteration": the experiment whose dataset, V and M are shared (None: own
 # ones) -> experiment -> (what it is, the change). The variant is `input`.
 CHANGES: dict[str | None, dict[str, tuple[str, dict[str, Any]]]] = {
@@ -86,8 +87,7 @@ def make_experiments() -> dict[str, Experiment]:
     """All experiments by name."""
     found: dict[str, Experiment] = {}
     for name in VARIANTS:
-        early = {"step_size_rule": "TPA", "tracks": 1}
-        paper = Config.preset("paper", variant=name, evolution=early)
+        paper = Config.preset("paper", variant=name, **EARLY_PAPER)
         no_bar = Config.preset("laptop", variant=name)
         first = no_bar.replace(data={"crop_bar": False}, evolution={"generations": 15})
         two = first.replace(**SECOND_ITERATION)
