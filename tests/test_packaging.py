@@ -273,6 +273,11 @@ def cells_of(file):
     return json.loads(file.read_text(encoding="utf-8"))["cells"]
 
 
+def texts_of(file):
+    """The sources of the Markdown cells of a notebook."""
+    return ["".join(cell["source"]) for cell in cells_of(file) if cell["cell_type"] == "markdown"]
+
+
 def code_of(file):
     """The code cells of a notebook: id -> source."""
     cells = [cell for cell in cells_of(file) if cell["cell_type"] == "code"]
@@ -291,14 +296,12 @@ def test_a_notebook_has_stable_cell_ids_short_cells_and_a_readable_length(file):
     lines = {name: source.splitlines() for name, source in code.items()}
     long = {name for name, own in lines.items() if len(own) > tall or max(map(len, own)) > wide}
     assert long <= folded
-    texts = ["".join(cell["source"]) for cell in cells_of(file) if cell["cell_type"] == "markdown"]
-    assert sum(len(text.split()) for text in texts) <= most
+    assert sum(len(text.split()) for text in texts_of(file)) <= most
 
 
 @pytest.mark.parametrize("file", NOTEBOOKS, ids=lambda file: file.stem)
 def test_the_steps_of_a_notebook_are_numbered_without_a_gap(file):
-    texts = ["".join(cell["source"]) for cell in cells_of(file) if cell["cell_type"] == "markdown"]
-    steps = re.findall(r"^## Step (\d+)\. ", "\n".join(texts), re.M)
+    steps = re.findall(r"^## Step (\d+)\. ", "\n".join(texts_of(file)), re.M)
     assert steps == [str(number) for number in range(1, len(steps) + 1)]
     assert len(steps) >= 4
 
