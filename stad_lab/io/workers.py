@@ -5,6 +5,7 @@ environment is Python code and needs processes. Any `concurrent.futures.Executor
 place, for example that of a Dask cluster. What a task returns depends on its arguments alone.
 """
 
+import contextlib
 import contextvars
 import itertools
 import multiprocessing
@@ -19,6 +20,7 @@ from concurrent.futures import CancelledError, Executor, Future
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any
 
 import cv2
@@ -150,6 +152,22 @@ def single_thread() -> None:
     cv2.setNumThreads(1)
 
 
+@contextmanager
+def interrupted_at_the_end() -> Iterator[None]:
+    """Hold an interrupt back until the end of a `with` block, where the main thread runs it."""
+    if threading.current_thread() is not threading.main_thread():  # which has no interrupts
+        yield
+        return
+    held: list[bool] = []
+    before = signal.signal(signal.SIGINT, lambda *_: held.append(True))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if held:
+        signal.raise_signal(signal.SIGINT)
+
+
 def run_tasks(
     executor: Executor,
     function: Callable,
@@ -169,20 +187,23 @@ def run_tasks(
     """
     to_begin = enumerate(tasks)
     waiting: dict[Future, int] = {}
+    # An interrupt in the middle of `submit` or `futures.wait` leaves locks behind that are never
+    # released, and the workers wait for them forever. `get` of this queue can be interrupted.
+    finished: SimpleQueue[Future] = SimpleQueue()
     name = getattr(getattr(function, "func", function), "__name__", str(function))
     try:
         while True:
             for number, task in itertools.islice(to_begin, (ahead or len(tasks)) - len(waiting)):
-                with task_errors(name):
-                    waiting[executor.submit(function, *task)] = number
+                with interrupted_at_the_end(), task_errors(name):
+                    waiting[future := executor.submit(function, *task)] = number
+                    future.add_done_callback(finished.put)
             if not waiting:
                 return
-            done = finished_first(waiting, patience)
-            while done:  # emptied, so that no result is kept
-                number = waiting.pop(future := done.pop())
-                with task_errors(name):
-                    result = future.result()
-                yield number, result
+            number = waiting.pop(future := next_finished(finished, patience))
+            with task_errors(name):
+                result = future.result()
+            del future  # or it would keep its result
+            yield number, result
     finally:
         for future in waiting:
             future.cancel()
@@ -205,12 +226,11 @@ def task_errors(name: str) -> Iterator[None]:
         raise TaskError(f"{name} failed in a worker: {type(error).__name__}: {error}") from error
 
 
-def finished_first(waiting: dict[Future, int], patience: float) -> set[Future]:
-    """The futures that are finished, as soon as there are any. TaskError after `patience`."""
+def next_finished(finished: SimpleQueue[Future], patience: float) -> Future:
+    """The next future that is finished, as soon as there is one. TaskError after `patience`."""
     for _ in range(SLICES):
-        done, _ = futures.wait(waiting, patience / SLICES, return_when=futures.FIRST_COMPLETED)
-        if done:
-            return done
+        with contextlib.suppress(Empty):
+            return finished.get(timeout=patience / SLICES)
     raise TaskError(f"no worker has finished anything for {patience:.0f} seconds: see if they live")
 
 

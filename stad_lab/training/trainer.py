@@ -24,6 +24,7 @@ from tqdm.auto import tqdm
 from stad_lab.config import check_same, random_stream
 from stad_lab.io.files import load_into, load_tensors, save_tensors
 from stad_lab.io.memory import keep_freed_memory, return_freed_memory
+from stad_lab.io.workers import interrupted_at_the_end
 
 ENTRIES = 20  # of the history, and checkpoints, in a training
 LARGEST_NORM = 100.0  # of the gradient, which is shortened to it
@@ -123,10 +124,14 @@ def check_finite(total: float, label: str, step: int) -> None:
 def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[int, tuple]]:
     """Every step with its batch, which a thread reads while the step before is trained."""
     with ThreadPoolExecutor(1) as reader:
-        following: Any = reader.submit(batch, steps.start) if steps else None
+
+        def begin(step: int) -> Any:
+            with interrupted_at_the_end():
+                return reader.submit(batch, step) if step < steps.stop else None
+
+        following = begin(steps.start)
         for step in steps:
-            present = following
-            following = reader.submit(batch, step + 1) if step + 1 < steps.stop else None
+            present, following = following, begin(step + 1)
             yield step, present.result()
 
 

@@ -1,12 +1,9 @@
 """Thin ipywidgets around figures: show them, and draw them again when a slider moves."""
 
 import base64
-import contextlib
 import html
 import io
-import signal
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import ipywidgets
 import numpy as np
@@ -14,6 +11,7 @@ import torch
 from IPython.display import HTML, DisplayHandle
 from matplotlib.figure import Figure
 
+from stad_lab.io.workers import interrupted_at_the_end
 from stad_lab.models.vae import VAE, to_array, to_uint8
 from stad_lab.training.evolution import Watch
 from stad_lab.viz.plots import difference_colors, to_png
@@ -70,6 +68,7 @@ def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]]
     place.display(HTML(""))  # an ordinary output stays in the page when the kernel is gone
 
     def update(entries: list[dict]) -> None:
+        # Matplotlib's compiled parts can make another error of an interrupt, or lose it.
         with interrupted_at_the_end():
             place.update(show(draw(entries)))
 
@@ -79,25 +78,6 @@ def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]]
         print("stopped: nothing that was logged is lost, run this cell again to go on")
         return False
     return True
-
-
-@contextlib.contextmanager
-def interrupted_at_the_end() -> Iterator[None]:
-    """Hold an interrupt back until the end of a `with` block, where the main thread runs it.
-
-    Matplotlib's compiled parts can make another error of an interrupt, or lose it.
-    """
-    if threading.current_thread() is not threading.main_thread():  # which has no interrupts
-        yield
-        return
-    held = []
-    before = signal.signal(signal.SIGINT, lambda *_: held.append(True))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if held:
-        raise KeyboardInterrupt
 
 
 def slider(low: float, high: float, value: float, label: str) -> ipywidgets.Widget:

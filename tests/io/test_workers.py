@@ -103,6 +103,33 @@ def test_the_tasks_of_an_aborted_call_do_not_go_on(tmp_path):
     assert len(list(tmp_path.iterdir())) < 10
 
 
+INTERRUPTED = """
+import faulthandler, os, random, signal, threading, time
+from stad_lab.io.workers import run_tasks, worker_threads
+
+def interrupt(seconds):
+    time.sleep(seconds)
+    os.kill(os.getpid(), signal.SIGINT)
+
+for number in range(600):
+    faulthandler.dump_traceback_later(10, exit=True)
+    delay = 0.002 + 0.005 * random.random()
+    try:
+        threading.Thread(target=interrupt, args=(delay,)).start()
+        while True:
+            with worker_threads(2) as executor:
+                list(run_tasks(executor, time.sleep, [(0,)] * 300))
+    except KeyboardInterrupt:
+        print(number)
+"""
+
+
+@unix
+def test_ctrl_c_ends_the_tasks_at_whatever_moment_it_comes(tmp_path):
+    process = run_script(tmp_path, INTERRUPTED)
+    assert process.stdout.split()[-1] == "599", process.stderr
+
+
 def test_a_task_that_is_cancelled_from_outside_is_an_error_with_its_remedy():
     with ThreadPoolExecutor(1) as executor:
         executor.submit(time.sleep, 0.2)  # keeps it busy, so that the next one can be cancelled
