@@ -134,7 +134,13 @@ def comparisons_table(study: dict) -> str:
             cells = (family, f"`{variant}`, {SEEN[features]}", difference_of(one))
             cells += (f"{low:.1f} to {high:.1f}", f"{one['deviation']:.0f}")
             lines.append((*cells, *(p_value(one[key]) for key in ("p", "holm_p")), outcome))
-    head = ("test", "arm less `frame`", "difference (95% interval)", "t-interval", "SD of pairs")
+    head = (
+        "test",
+        "variant less `frame`",
+        "difference (95% interval)",
+        "t-interval",
+        "SD of pairs",
+    )
     return table((*head, "p", "Holm's p", "verdict"), lines)
 
 

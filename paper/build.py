@@ -44,6 +44,8 @@ def facts(claims: dict) -> dict:
     gains = {f"gain of {name}": score - PAPER["frame"] for name, score in PAPER.items()}
     gain, most = sorted(gains.values())[1], max(gains.values())
     own = {"paper": dict(PAPER), "gain": gain, "most gain": most, **gains}
+    runs = claims["experiments"]["paper_frame"]["runs"]
+    own |= {"lowest paper_frame": min(runs), "highest paper_frame": max(runs)}
     own["networks"] = blocks.NUMBERS["trained networks"](claims)
     return claims | own | {"recipe": Config.preset("laptop").as_dict()}
 

@@ -35,9 +35,9 @@ def describe_comparison(features: str, one: dict) -> str:
 
 def describe_interaction(one: dict) -> str:
     """Whether the two effects differ; the protocol has no such test."""
-    differ = "differ" if one["p"] < LEVEL else "do not differ significantly"
-    text = f"Computed afterwards: the two effects {differ}"
-    return f"{text} (by {one['difference']:.1f} points, p = {one['p']:.3f})."
+    significant = "significant" if one["p"] < LEVEL else "not significant"
+    text = f"Computed afterwards: the effects differ by {one['difference']:.1f} points,"
+    return f"{text} {significant} (p = {one['p']:.3f})."
 
 
 def describe_paper_gain(primary: dict[str, dict]) -> str:
