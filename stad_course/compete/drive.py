@@ -1,7 +1,8 @@
 """A competition: every submission drives the hidden tracks, and its results are kept as they come.
 
 An episode in which a submission fails scores LOST. A batch with a failure is driven again one track
-at a time, so that the others are not lost; after MOST_FAILURES the remaining tracks are.
+at a time, so that the others are not lost; after MOST_FAILURES the remaining tracks are. If it then
+drives all of them, the batch itself counts as a failure: nobody shall break down for a second try.
 """
 
 from dataclasses import asdict
@@ -71,12 +72,14 @@ def compete(
     ]
     for _, _, _, file, *_ in tasks:
         check_conditions(file, tracks, limits)
+    results = {}
     with worker_threads(processes) as executor:
         for number, result in run_tasks(executor, drive_submission, tasks, patience=86_400.0):
+            results[number] = result | {"name": tasks[number][0]}
             mean, errors = np.mean(result["returns"]), result["failures"]
             said = f"  {errors[0]}" if errors else ""
             print(f"{tasks[number][0]:<24} {mean:8.1f}{said}", flush=True)
-    return [load_json(task[3], kind=KIND) | {"name": task[0]} for task in tasks]
+    return [results[number] for number in range(len(tasks))]
 
 
 def conditions(tracks: list[int], limits: Limits) -> dict[str, Any]:
@@ -138,8 +141,11 @@ def drive_batch(
             result["failures"].append(str(failure))
             result["returns"].append(LOST)
         else:
+            before = len(result["failures"])
             for track in tracks:
                 drive_batch(path, [track], result, limits, hidden)
+            if len(result["failures"]) == before:
+                result["failures"].append(f"only with {len(tracks)} cars at once: {failure}")
         return
     first = len(result["returns"])
     result["returns"] += returns.tolist()

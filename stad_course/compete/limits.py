@@ -11,9 +11,9 @@ class Limits:
     """What a submission may use.
 
     Args:
-        start: seconds to load, and for its first action.
+        start: seconds to load, to begin episodes, and for its first action.
         step: seconds for each observation, on average over the cars of a batch.
-        total: seconds for all its actions on all tracks.
+        total: seconds for all that it is asked on all tracks; loading does not count.
         memory: gigabytes of its process.
     """
 

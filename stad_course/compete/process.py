@@ -1,8 +1,8 @@
 """The parent's end of a submission's process: limits, isolation, and what went wrong in one line.
 
 On Linux with user namespaces the process has no network, sees no process but its own, cannot write
-outside its folder, and cannot see the hidden tracks or other submissions. Elsewhere it has the
-rights of whoever runs the competition.
+outside its folder, and cannot see the hidden tracks or other submissions (`isolate`). Elsewhere it
+has the rights of whoever runs the competition.
 """
 
 import contextlib
@@ -28,26 +28,9 @@ from stad_course.compete.protocol import receive, send
 PAUSE = 0.05  # seconds between two looks of the watchdog
 LARGEST_SUBMISSION = 300_000_000  # bytes
 LOWEST, HIGHEST = (-1.0, 0.0, 0.0), (1.0, 1.0, 1.0)  # steering, gas and brake
-# In new namespaces: hide $2 (a file), and the folders after --; only the folder $1 is writable.
-ISOLATE = """
-set -e
-work=$1; shift
-mount --bind "$work" "$work"
-while [ "$1" != -- ]; do
-  if [ -d "$1" ]; then mount -t tmpfs none "$1"; else mount --bind /dev/null "$1"; fi
-  shift
-done
-shift
-while [ "$1" != -- ]; do
-  mount --bind "$1" "$1"; mount -o remount,bind,ro "$1"; shift
-done
-shift
-mount -o remount,bind,ro /
-cd "$work"
-exec "$@"
-"""
 UNSHARE = ["unshare", "--user", "--map-root-user", "--net", "--ipc", "--mount", "--pid", "--fork"]
 UNSHARE += ["--kill-child", "--mount-proc"]
+PACKAGE = Path(stad_lab.__file__).resolve().parent
 
 
 class Failure(Exception):
@@ -57,11 +40,37 @@ class Failure(Exception):
 @functools.cache
 def can_isolate() -> bool:
     """Whether this system lets us start processes in namespaces of their own."""
-    if sys.platform != "linux" or not shutil.which("unshare"):
+    if sys.platform != "linux" or not all(map(shutil.which, ("unshare", "setpriv"))):
         return False
     with tempfile.TemporaryDirectory() as work:
-        command = [*UNSHARE, "sh", "-c", ISOLATE, "sh", work, "--", "--", "true"]
-        return subprocess.run(command, capture_output=True).returncode == 0
+        command = isolated(Path(work), (), ["true"])
+        return subprocess.run(command, capture_output=True, env=environment(work)).returncode == 0
+
+
+def isolated(work: Path, hidden: tuple[Path, ...], command: list[str]) -> list[str]:
+    """A command that runs another one in namespaces of its own; see `isolate`."""
+    covered = [str(one.resolve()) for one in hidden if one.exists()]
+    isolate = [sys.executable, "-P", "-m", "stad_course.compete.isolate", str(work), *covered]
+    return [*UNSHARE, *isolate, "--", *command]
+
+
+def environment(home: str | Path) -> dict[str, str]:
+    """The variables of a submission's process, whose files lie in a folder."""
+    kept = ("PATH", "LANG", "SYSTEMROOT", "NUMBA_CACHE_DIR", "LD_LIBRARY_PATH")
+    return {name: os.environ[name] for name in kept if name in os.environ} | {
+        "PYTHONPATH": str(PACKAGE.parent),
+        "PYTHONDONTWRITEBYTECODE": "1",
+        "PYTHONIOENCODING": "utf-8",
+        "OMP_NUM_THREADS": "1",
+        "CUDA_VISIBLE_DEVICES": "",
+        **dict.fromkeys(("HOME", "TMPDIR", "MPLCONFIGDIR"), str(home)),
+    }
+
+
+@functools.cache
+def shared_folder() -> tempfile.TemporaryDirectory:
+    """In which the folders of all submissions lie, until this process ends: each sees its own."""
+    return tempfile.TemporaryDirectory(prefix="stad_lab-")
 
 
 class Submission:
@@ -85,7 +94,7 @@ class Submission:
         self.limits, self.used, self.hidden = limits, used, hidden
         self.deadline, self.bound = float("inf"), ""  # of the answer that is awaited
         self.broken, self.fresh = "", True
-        self.folder = Path(tempfile.mkdtemp(prefix="stad_lab-")).resolve()
+        self.folder = Path(tempfile.mkdtemp(dir=shared_folder().name)).resolve()
         try:
             self.process = self._start(copied(path, self.folder))
             threading.Thread(target=self._watch, daemon=True).start()
@@ -132,34 +141,19 @@ class Submission:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _start(self, path: Path) -> subprocess.Popen[bytes]:
-        package = Path(stad_lab.__file__).resolve().parent
         command = [sys.executable, "-P", "-m", "stad_course.compete.child", str(path)]
         command.append(str(round(self.limits.memory * 1e9)))
-        isolated = can_isolate()
-        if isolated:
-            hidden = [str(one.resolve()) for one in self.hidden if one.exists()]
-            fixed = [str(package), str(Path(sys.prefix).resolve())]
-            own = [str(self.folder), *hidden, "--", *fixed, "--"]
-            command = [*UNSHARE, "sh", "-c", ISOLATE, "sh", *own, *command]
-        kept = ("PATH", "LANG", "SYSTEMROOT", "NUMBA_CACHE_DIR", "LD_LIBRARY_PATH")
-        environment = {name: os.environ[name] for name in kept if name in os.environ} | {
-            "PYTHONPATH": str(package.parent),
-            "PYTHONDONTWRITEBYTECODE": "1",
-            "PYTHONIOENCODING": "utf-8",
-            "OMP_NUM_THREADS": "1",
-            "CUDA_VISIBLE_DEVICES": "",
-            "HOME": str(self.folder),
-            "TMPDIR": str(self.folder),
-            "MPLCONFIGDIR": str(self.folder),
-            "STAD_LAB_ISOLATED": "1" if isolated else "",
-        }
+        variables = environment(self.folder)
+        if can_isolate():
+            command = isolated(self.folder, (self.folder.parent, *self.hidden), command)
+            variables["STAD_LAB_ISOLATED"] = "1"
         return subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
             cwd=self.folder,
-            env=environment,
+            env=variables,
             start_new_session=os.name != "nt",
         )
 
@@ -170,7 +164,7 @@ class Submission:
         begin = time.monotonic()
         begins = kind != "act" or self.fresh
         self.bound = f"{seconds:g} s to begin" if begins else f"{self.limits.step:g} s"
-        if kind == "act" and (left := self.limits.total - self.used) < seconds:
+        if kind and (left := self.limits.total - self.used) < seconds:
             seconds, self.bound = left, f"{self.limits.total:g} s in all"
         self.deadline = begin + seconds
         try:
@@ -180,14 +174,15 @@ class Submission:
             answer, actions = receive(stdout, np.float64, most)
         except (EOFError, OSError):
             raise self._failed(self._ending()) from None
-        except (ValueError, TypeError, RecursionError):
+        except (ValueError, TypeError, KeyError, RecursionError):
             raise self._failed("it wrote into the pipe of its answers") from None
         finally:
             self.deadline = float("inf")
-            if kind == "act" and not self.fresh:
+            if kind:  # all but loading
                 self.used += time.monotonic() - begin
         if answer.get("kind") == "error":
-            raise self._failed(self.broken or str(answer.get("text"))[:500])
+            text = filter(str.isprintable, str(answer.get("text"))[:500])  # it may be shown raw
+            raise self._failed(self.broken or "".join(text))
         return actions
 
     def _failed(self, reason: str) -> Failure:
@@ -213,8 +208,9 @@ class Submission:
             else:
                 self.broken = self._excess()
             if self.broken:
-                return self._kill()
+                break
             time.sleep(PAUSE)
+        self._kill()  # what it started may hold the pipe of its answers
 
     def _excess(self) -> str:
         """What the process and its descendants take too much of; empty if nothing."""
@@ -237,6 +233,8 @@ class Submission:
             family = psutil.Process(self.process.pid).children(recursive=True)
         with contextlib.suppress(OSError):
             self.process.kill()
+            if os.name != "nt":
+                os.killpg(self.process.pid, signal.SIGKILL)
         for one in family:
             with contextlib.suppress(psutil.Error):
                 one.kill()

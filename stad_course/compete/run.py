@@ -2,6 +2,7 @@
 
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 from stad_course.compete.drive import (
@@ -14,7 +15,7 @@ from stad_course.compete.drive import (
 )
 from stad_course.compete.limits import Limits
 from stad_course.compete.page import leaderboard
-from stad_course.compete.process import can_isolate
+from stad_course.compete.process import PACKAGE, can_isolate
 from stad_course.compete.ranking import rank
 from stad_course.compete.tracks import hide_tracks, load_tracks
 from stad_lab.io.files import locked, write_bytes
@@ -34,6 +35,8 @@ def run(
     """Drive all submissions and the baselines, and write the leaderboard; returns its path."""
     if out.resolve().is_relative_to(submissions.resolve()):
         raise ValueError(f"--out {out} lies in the folder of submissions: choose another")
+    for folder in (submissions, out):
+        check_hidden(folder)
     tracks, commitment = load_tracks(secret)
     ours = BASELINES if baselines else {}
     entries = {f"{BASELINE}{name}": path for name, path in ours.items()}
@@ -49,6 +52,14 @@ def run(
         file = out / "leaderboard.html"
         write_bytes(file, leaderboard(table, tracks, commitment, facts).encode())
     return file
+
+
+def check_hidden(folder: Path) -> None:
+    """Raise ValueError for a folder that no submission can do without."""
+    for needed in (PACKAGE, Path(sys.prefix).resolve()):
+        if needed.is_relative_to(folder.resolve()):
+            reason = f"holds {needed}, which submissions need, and is hidden from them"
+            raise ValueError(f"{folder} {reason}: choose another folder")
 
 
 def write_kit(file: Path) -> str:

@@ -1,12 +1,15 @@
 """The competition: a submission costs itself alone, and a ranking can be continued and checked."""
 
 import json
+import os
+import time
 import zlib
 
 import numpy as np
 import pytest
 from course.submissions import CHEATS, MISBEHAVE, source, write_class
 
+import stad_lab
 from stad_course.cli import main
 from stad_course.compete.drive import (
     LOST,
@@ -84,14 +87,21 @@ def test_a_submission_sees_neither_hidden_tracks_nor_other_processes_and_writes_
         "import pathlib\n"
         f"assert not pathlib.Path({str(secret)!r}).read_bytes(), 'saw the tracks'\n"
         "assert len([p for p in pathlib.Path('/proc').iterdir() if p.name.isdigit()]) < 5\n"
-        "for place in (pathlib.Path('/etc'), pathlib.Path(__import__('stad_lab').__path__[0])):\n"
+        "import os, subprocess\n"
+        f"subprocess.run(['umount', {str(secret)!r}], stderr=subprocess.DEVNULL)\n"
+        "subprocess.run(['mount', '-o', 'remount,bind,rw', '/'], stderr=subprocess.DEVNULL)\n"
+        f"assert not pathlib.Path({str(secret)!r}).read_bytes(), 'uncovered the tracks'\n"
+        "assert len(list(pathlib.Path.cwd().parent.iterdir())) == 1, 'saw another submission'\n"
+        "package = pathlib.Path(__import__('stad_lab').__path__[0])\n"
+        "for place in (pathlib.Path('/etc'), pathlib.Path('/dev/shm'), package):\n"
         "    try:\n        (place / 'spy').touch()\n"
         "    except OSError:\n        continue\n"
         "    raise AssertionError(f'wrote to {place}')\n"
         "class Agent:\n    def act(self, observation): return [0, 0, 0]\n"
         "make_agent = Agent\n"
     )
-    with Submission(file, Limits(), hidden=(secret,)) as driver:
+    other = Submission(STARTER / "my_agent.py", Limits())
+    with other, Submission(file, Limits(), hidden=(secret,)) as driver:
         driver.reset()
         assert driver.act_batch(np.zeros((1, 96, 96, 3), np.uint8)).tolist() == [[0, 0, 0]]
 
@@ -143,6 +153,7 @@ def test_results_under_other_conditions_are_refused_and_kept(held, capsys):
         ("compete CLASS --secret SECRET --limits.step nan", "limits.step=nan: expected more than"),
         ("compete CLASS --secret SECRET --limits.memory inf", "limits.memory=inf: expected more"),
         ("compete CLASS --secret SECRET --out CLASS/out", "lies in the folder of submissions"),
+        ("compete CLASS --secret SECRET --out PACKAGE", "which submissions need, and is hidden"),
         ("compete CLASS --secret AGENT", "is no file of hidden tracks"),
         ("compete OURS --secret SECRET", "names with 'baseline-' are those of our agents"),
         ("commit SECRET --tracks 7", "has 2 tracks, not 7"),
@@ -158,6 +169,7 @@ def test_what_would_cost_results_is_refused_in_one_line(arguments, expected, tmp
     agent.write_bytes((STARTER / "my_agent.py").read_bytes())
     hide_tracks(tmp_path / "tracks.json", 2)
     places = {"CLASS": "class", "SECRET": "tracks.json", "OURS": "ours"}
+    places["PACKAGE"] = stad_lab.__path__[0]
     for name, place in places.items():
         arguments = arguments.replace(name, str(tmp_path / place))
     assert main(arguments.replace("AGENT", str(agent)).split()) == 2
@@ -178,6 +190,52 @@ def test_each_track_on_which_a_submission_breaks_down_costs_that_track_alone(tmp
         drive_batch(path, list(tracks), result, Limits(), ())
     assert [n for n, own in enumerate(result["returns"]) if own == LOST] == [3, 13]
     assert len(result["failures"]) == 2
+
+
+TWO = """
+made = []
+def make_agent():
+    made.append(Agent())
+    return made[-1]
+class Agent:
+    def act(self, observation):
+        {line}
+        return [0, 0, 0]
+"""
+LIE = """import os, contextlib
+        for one in range(3, 9):
+            with contextlib.suppress(OSError):
+                os.write(one, b'{"kind": "actions", "size": 24}' + bytes([10] + [0] * 24))"""
+
+
+@pytest.mark.parametrize(
+    ("line", "tracks", "lost", "said"),
+    [
+        ("if len(made) > 1: raise ValueError('two')", [0, 1], 0, "only with 2 cars at once: Val"),
+        (LIE, [0], 1, "it wrote into the pipe of its answers"),
+    ],
+)
+def test_a_failure_that_no_track_shows_and_a_forged_answer_count(
+    line, tracks, lost, said, tmp_path
+):
+    path = tmp_path / "agent.py"
+    path.write_text(TWO.format(line=line))
+    result = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
+    drive_batch(path, tracks, result, Limits(), ())
+    assert result["returns"].count(LOST) == lost
+    assert len(result["failures"]) == 1 and said in result["failures"][0]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no fork")
+def test_what_a_dead_submission_has_started_is_not_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr("stad_course.compete.process.can_isolate", lambda: False)
+    line = "import os, time\n        if os.fork(): os.kill(os.getpid(), 9)\n        time.sleep(60)"
+    path = tmp_path / "agent.py"
+    path.write_text(TWO.format(line=line))
+    result = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
+    begin = time.monotonic()
+    drive_batch(path, [0], result, Limits(), ())
+    assert "SIGKILL" in result["failures"][0] and time.monotonic() - begin < 30
 
 
 def test_who_used_up_the_whole_time_reads_the_limit_of_the_whole(tmp_path):
