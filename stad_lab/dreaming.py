@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from stad_lab.agent import Agent, EnvBatch, rollout, run_folder
+from stad_lab.agent import MAX_FRAMES, Agent, EnvBatch, rollout, run_folder
 from stad_lab.envs.arguments import whole_number
 from stad_lab.envs.dream import DreamEnv
 from stad_lab.envs.dreams import DreamVector
@@ -58,6 +58,7 @@ def dream_on(
     Returns:
         The dreamed frames, uint8 (frames, 64, 64, 3), and the actions, float32 (frames, 3).
     """
+    frames = whole_number("frames", frames, 1, MAX_FRAMES)
     seed = whole_number("seed", seed, 0, 2**63 - 1)
     state = to_state(agent.state)
     if state is None:

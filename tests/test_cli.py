@@ -380,8 +380,9 @@ def test_a_run_of_another_configuration_ends_in_one_clear_line(option, value, wa
 def test_a_preset_may_stand_anywhere_and_a_wrong_one_in_the_environment_breaks_train_alone(
     monkeypatch,
 ):
-    for command in ("train quick --out run", "train --out run quick", "train --out quick quick"):
-        arguments = parse(command.split()).keywords
+    orders = ("quick --out run", "--out run quick", "--out quick quick", "--out=run quick")
+    for command in (*orders, "--out run --tensorboard quick"):
+        arguments = parse(["train", *command.split()]).keywords
         assert arguments["config"] == QUICK and arguments["out"] in ("run", "quick")
     monkeypatch.setenv("STAD_LAB_PRESET", "bogus")
     assert parse(["evaluate", "--agent", "frame"]).keywords["agent"] == "frame"

@@ -76,8 +76,8 @@ class DreamEnv(gym.Env):
         self.state = (zeros, zeros.clone()) if state is None else state
         if not isinstance(self.state, tuple | list) or len(self.state) != 2:
             raise ValueError(f"state={shown(self.state)}: expected M's memory (h, c)")
-        for part in self.state:
-            finite_array("memory", part, tuple(zeros.shape), "h and c of one car")
+        parts = (("memory", part, tuple(zeros.shape), "h and c of one car") for part in self.state)
+        self.state = tuple(torch.from_numpy(finite_array(*part)) for part in parts)
         self.frames = 0
         return self.latents.numpy().copy(), {"hidden": self.hidden}
 

@@ -14,6 +14,7 @@ from stad_lab.envs.physics import PLAYFIELD
 from stad_lab.envs.track import MAX_TILES, STEP_LENGTH, TRACK_WIDTH, TURN_RATE, Track, pave
 
 LARGEST_FILE = 1_000_000  # bytes
+FEWEST_TILES = 3  # with less, no tile has a direction; the bends of a lap need far more
 SAMPLES = 64  # points of the curve between two checkpoints, before it is cut into tiles
 CLOSEST = 2 * TRACK_WIDTH  # world units between two parts of the road
 NEIGHBOURS = 12  # tiles along the road, which may be nearer than that
@@ -72,9 +73,9 @@ def find_own_path(points: np.ndarray) -> np.ndarray:
     lengths = np.hypot(*np.diff(curve, axis=0).T)
     along = np.concatenate([[0], np.cumsum(lengths)])
     count = round(along[-1] / STEP_LENGTH)
-    if not 0 < count <= MAX_TILES:
-        longest = f"{MAX_TILES * STEP_LENGTH:.0f}"
-        raise ValueError(f"a lap of {along[-1]:.0f} world units: expected at most {longest}")
+    if not FEWEST_TILES <= count <= MAX_TILES:
+        expected = " to ".join(f"{tiles * STEP_LENGTH:.0f}" for tiles in (FEWEST_TILES, MAX_TILES))
+        raise ValueError(f"a lap of {along[-1]:.0f} world units: expected {expected}")
     places = np.arange(count) * along[-1] / count
     x, y = (np.interp(places, along, part) for part in curve.T)
     ahead_x, ahead_y = (np.roll(part, -1) - np.roll(part, 1) for part in (x, y))

@@ -4,6 +4,7 @@ What we report is driven in Gymnasium's own CarRacing-v3 with its own renderer, 
 `config.REPORTED_TRACKS`. Each track is named by its seed, so that anyone can drive it again.
 """
 
+import shlex
 import time
 from concurrent.futures import Executor
 from contextlib import suppress
@@ -84,8 +85,10 @@ def evaluate(
                 write_unfinished(unfinished, asked, driven, time.perf_counter() - begin)
     returns, lengths = zip(*(driven[str(track)] for track in tracks), strict=True)
     result = report(tracks, np.array(returns), np.array(lengths))
-    seconds, command = time.perf_counter() - begin, f"python -m stad_lab evaluate --agent {source}"
-    made_with = provenance(f"{command} --episodes {episodes} --first-track {first_track}")
+    seconds = time.perf_counter() - begin
+    command = f"python -m stad_lab evaluate --agent {shlex.quote(str(source))}"
+    command += f" --episodes {episodes} --first-track {first_track}{' --fast' * fast}"
+    made_with = provenance(command)
     return {"kind": KIND, **identity, **result, "seconds": seconds, "made_with": made_with}
 
 

@@ -74,8 +74,10 @@ def worker_threads(count: int, given: Executor | None = None) -> Iterator[Execut
         yield executor
     finally:
         cancelled.set()
-        executor.shutdown(cancel_futures=True)
-        torch.set_num_threads(threads)  # tasks set it to 1, for all threads that come later
+        try:
+            executor.shutdown(cancel_futures=True)
+        finally:
+            torch.set_num_threads(threads)  # tasks set it to 1, for all threads that come later
 
 
 class WorkerProcesses(futures.ProcessPoolExecutor):

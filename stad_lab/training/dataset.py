@@ -305,8 +305,12 @@ def dataset_checksum(manifest: dict) -> str:
 def check_seen(path: Path, seen: str | None, folder: Path) -> None:
     """Raise ValueError if the weights in `path` were trained on another dataset than `folder`'s.
 
-    `seen` is the checksum of the dataset that they were trained on, or None if it is not known.
+    `seen` is the checksum of the dataset that they were trained on, or None if it is not known. A
+    dataset that is not complete has none to compare.
     """
-    manifest = Path(folder) / MANIFEST
-    if seen and manifest.exists() and seen != dataset_checksum(load_manifest(manifest)):
+    if not seen or not (file := Path(folder) / MANIFEST).exists():
+        return
+    manifest = load_manifest(file)
+    found, wanted = count_episodes(manifest)
+    if found == wanted and seen != dataset_checksum(manifest):
         raise ValueError(f"{path} was trained on another dataset than {folder}: give its own one")

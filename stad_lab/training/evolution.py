@@ -93,20 +93,20 @@ def evolve(
     chosen = log["best"] and log["best"]["generation"]
     if chosen and kept == chosen and done >= settings.generations:
         return False
-    with locked(folder), threadpool_limits(1):
+    workers = worker_threads(config.processes, executor)  # restores the threads of before the limit
+    with locked(folder), workers as executor, threadpool_limits(1):
         run = resume(config, folder, world_model, log)
         if chosen and kept != chosen:
             keep_controller(run, run.controller(chosen))
-        with worker_threads(config.processes, executor) as executor:
-            source = drives or hand_out(executor, folder)
-            label = f"evolve C ({config.variant})"
-            bar = tqdm(range(done, settings.generations), label, settings.generations, initial=done)
-            for _ in bar:
-                run_generation(run, executor, source)
-                worst, mean, best = fitness_curves(log["generations"][-1:])[:, 0]
-                bar.set_postfix_str(f"worst {worst:.0f}, mean {mean:.0f}, best {best:.0f}")
-                if watch:
-                    watch(log["generations"])
+        source = drives or hand_out(executor, folder)
+        label, last = f"evolve C ({config.variant})", settings.generations
+        bar = tqdm(range(done, last), label, last, initial=done)
+        for _ in bar:
+            run_generation(run, executor, source)
+            worst, mean, best = fitness_curves(log["generations"][-1:])[:, 0]
+            bar.set_postfix_str(f"worst {worst:.0f}, mean {mean:.0f}, best {best:.0f}")
+            if watch:
+                watch(log["generations"])
     return True
 
 

@@ -17,8 +17,8 @@ from stad_lab.config import Config, check_same
 from stad_lab.io import weights
 from stad_lab.io.files import copy_file
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE
-from stad_lab.training.evolution import evolve
-from stad_lab.training.pipeline import run_stages
+from stad_lab.training.evolution import LOG, evolve
+from stad_lab.training.pipeline import check_apart, run_stages
 from stad_lab.training.record import read_finished
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE, load_start, save_start
 
@@ -62,6 +62,7 @@ def fine_tune(
         OSError, TaskError: as `evolve`.
     """
     earlier, folder = Path(earlier), Path(folder)
+    check_apart(earlier, folder)
     before = read_finished(earlier)
     fixed = {name: value for name, value in config.as_dict().items() if name != "processes"}
     settings = dataclasses.asdict(config.evolution)
@@ -76,13 +77,19 @@ def fine_tune(
 
 
 def begin(config: Config, earlier: Path, folder: Path) -> bool:
-    """Copy the earlier run's V, M and components, and its C as the first one; False if done."""
+    """Copy the earlier run's V, M and components, and its C as the first one; False if done.
+
+    ValueError, before anything is written, if the folder holds another run.
+    """
+    if (folder / LOG).exists() and not (folder / START_FILE).exists():
+        raise ValueError(f"{folder} holds a run that continues no other: choose another folder")
     for name in (VAE_FILE, MDN_RNN_FILE, COMPONENTS_FILE):
         if (earlier / name).exists() and not (folder / name).exists():
             copy_file(earlier / name, folder)
     path, world_model = folder / START_FILE, weights.load_world_model(folder)
     parameters, metadata = weights.load_controller(earlier / CONTROLLER_FILE)
-    weights.check_belongs(earlier / CONTROLLER_FILE, metadata, **world_model.checksums)
+    if any(metadata[name] != value for name, value in world_model.checksums.items()):
+        raise ValueError(f"{folder} holds another V or M than {earlier}: choose another folder")
     if path.exists():
         if not np.array_equal(load_start(path, world_model), parameters):
             raise ValueError(f"{folder} continues from another C than that of {earlier}")

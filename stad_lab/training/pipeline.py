@@ -100,6 +100,7 @@ def train(
     before = None
     if earlier is not None:
         earlier = Path(earlier)
+        check_apart(earlier, folder)
         before = read_finished(earlier)
         second_iteration.check_earlier_agent(config, earlier)
     check_stages(config, folder, data)
@@ -133,6 +134,12 @@ def make_stages(
     }
 
 
+def check_apart(earlier: Path, folder: Path) -> None:
+    """Raise ValueError if a run would be continued in its own folder."""
+    if earlier.resolve() == folder.resolve():
+        raise ValueError(f"{folder} is the run that is continued: choose another folder for --out")
+
+
 def check_stages(config: Config, folder: Path, data: Path) -> None:
     """Raise ValueError, before any work, if a finished stage in the folder is of another run.
 
@@ -146,10 +153,11 @@ def check_stages(config: Config, folder: Path, data: Path) -> None:
     if (folder / VAE_FILE).exists():
         seen = check_vae(config, None, folder)["dataset"]
         check_seen(folder / VAE_FILE, seen, data)
-    if (folder / MDN_RNN_FILE).exists():
-        check_mdn_rnn(config, folder)
-        if (folder / LOG).exists():
-            read_log(config, folder, load_world_model(folder))
+        # Without V, for example because a damaged one was deleted, M is checked when V is trained.
+        if (folder / MDN_RNN_FILE).exists():
+            check_mdn_rnn(config, folder)
+            if (folder / LOG).exists():
+                read_log(config, folder, load_world_model(folder))
 
 
 def run_stages(

@@ -18,6 +18,7 @@ import torch
 from stad_lab.config import PRESETS, Config, check_same, fields_of
 from stad_lab.io.files import load_json, save_json
 from stad_lab.io.weights import VAE_FILE
+from stad_lab.io.workers import interrupted_at_the_end
 from stad_lab.training import second_iteration
 from stad_lab.training.dataset import MANIFEST, made_with
 from stad_lab.training.evolution import LOG
@@ -89,12 +90,14 @@ def timed(record: dict, made: dict, stage: str, folder: Path) -> Iterator[Callab
     its time.
     """
     before, begin, ended = record["seconds"].get(stage, 0.0), time.perf_counter(), threading.Event()
+    alone = threading.Lock()
 
     def note() -> None:
-        record["seconds"][stage] = before + time.perf_counter() - begin
-        if made != starts(record)[-1]:
-            record["continued_with"] = [*starts(record)[1:], made]
-        save_json(folder / RECORD, record)
+        with interrupted_at_the_end(), alone:  # or it would be changed while it is written
+            record["seconds"][stage] = before + time.perf_counter() - begin
+            if made != starts(record)[-1]:
+                record["continued_with"] = [*starts(record)[1:], made]
+            save_json(folder / RECORD, record)
 
     def beat() -> None:
         while not ended.wait(HEARTBEAT):

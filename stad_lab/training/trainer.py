@@ -124,15 +124,12 @@ def check_finite(total: float, label: str, step: int) -> None:
 def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[int, tuple]]:
     """Every step with its batch, which a thread reads while the step before is trained."""
     with ThreadPoolExecutor(1) as reader:
-
-        def begin(step: int) -> Any:
-            with interrupted_at_the_end():
-                return reader.submit(batch, step) if step < steps.stop else None
-
-        following = begin(steps.start)
+        following: Any = reader.submit(batch, steps.start) if steps else None
         for step in steps:
-            present, following = following, begin(step + 1)
-            yield step, present.result()
+            with interrupted_at_the_end():  # within them it leaves a lock that nobody releases
+                ready = following.result()
+                following = reader.submit(batch, step + 1) if step + 1 < steps.stop else None
+            yield step, ready
 
 
 @contextlib.contextmanager

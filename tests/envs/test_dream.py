@@ -121,6 +121,12 @@ def test_a_memory_that_does_not_fit_is_refused(cars, value, dream):
         dream.reset(options={"state": state})
 
 
+def test_a_memory_may_be_given_as_arrays(dream):
+    state = (np.full((1, 1, dream.mdn_rnn.hidden_size), 0.5, np.float32),) * 2
+    _, info = dream.reset(options={"state": state})
+    assert np.array_equal(info["hidden"], state[0][0, 0])
+
+
 @pytest.mark.parametrize("temperature", [0, -1, 1e-7, float("nan"), float("inf")])
 def test_a_temperature_that_cannot_be_sampled_is_refused(temperature, agent):
     with pytest.raises(ValueError, match=f"temperature={temperature}: expected a finite number"):
@@ -146,6 +152,8 @@ def test_an_agent_is_not_changed_by_its_dream(agent, observations):
     for observation in observations[:10]:
         agent.act(observation)
     before = agent.state.copy(), agent.latents.copy()
+    with pytest.raises(ValueError, match="frames=1001: expected a whole number from 1 to"):
+        dream_on(agent, 1001)
     pictures, actions = dream_on(agent, 12, temperature=0.8, seed=3)
     assert pictures.shape == (12, 64, 64, 3)
     assert pictures.dtype == np.uint8
@@ -207,7 +215,7 @@ def test_an_agent_that_has_not_acted_cannot_dream(agent):
 def test_a_dream_of_no_frame_is_refused(agent, observations):
     agent.reset()
     agent.act(observations[0])
-    with pytest.raises(ValueError, match="max_frames=0: expected a whole number from 1"):
+    with pytest.raises(ValueError, match="frames=0: expected a whole number from 1"):
         dream_on(agent, 0)
 
 

@@ -27,10 +27,11 @@ from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.evaluation.statistics import summarise
 from stad_lab.evaluation.verify import verify, verify_dataset
 from stad_lab.io.files import load_json, load_tensors, save_json, save_tensors, write_bytes
+from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE
 from stad_lab.io.workers import TaskError
 from stad_lab.training import dataset, evolution, pipeline, record
-from stad_lab.training.dataset import Dataset
-from stad_lab.training.evolution import evolve
+from stad_lab.training.dataset import MANIFEST, Dataset
+from stad_lab.training.evolution import LOG, evolve
 from stad_lab.training.mdn_rnn import train_mdn_rnn
 from stad_lab.training.pipeline import STAGES, train
 from stad_lab.training.record import open_record, provenance, read_finished
@@ -206,6 +207,19 @@ def restore_weights(whole, folder):
     for part in TRAININGS:
         if not (folder / f"{part}.safetensors").exists():
             shutil.copy(whole / f"{part}.safetensors", folder)
+
+
+def test_a_run_that_lost_its_v_or_half_its_dataset_is_mended_by_the_same_command(
+    whole, tmp_path, in_this_process
+):
+    folder = shutil.copytree(whole, tmp_path / "run")
+    before = {name: (folder / name).read_bytes() for name in (VAE_FILE, MDN_RNN_FILE, LOG)}
+    (folder / VAE_FILE).unlink()
+    assert train(QUICK, folder, executor=in_this_process)
+    manifest = load_json(folder / "dataset" / MANIFEST)
+    save_json(folder / "dataset" / MANIFEST, manifest | {"episodes": manifest["episodes"][:-1]})
+    assert train(QUICK, folder, executor=in_this_process)
+    assert {name: (folder / name).read_bytes() for name in before} == before
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -83,11 +83,18 @@ def test_a_folder_with_another_v_and_m_is_refused(quick_run, tmp_path):
     for part in ("vae", "mdn_rnn"):
         shutil.copy(PRETRAINED / "input_output" / f"{part}.safetensors", tmp_path)
     config, before = brief_config(quick_run), sorted(tmp_path.iterdir())
-    with pytest.raises(
-        ValueError, match=r"was made with another vae .*: give V, M and C of one run"
-    ):
+    with pytest.raises(ValueError, match=r"holds another V or M than .*: choose another folder"):
         begin(config, quick_run, tmp_path)
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_finished_run_is_not_fine_tuned_in_place(quick_run, tmp_path):
+    run = copy_run(quick_run, tmp_path / "run")
+    before = {path: path.read_bytes() for path in run.iterdir()}
+    for earlier in (run, quick_run):
+        with pytest.raises(ValueError, match="choose another folder"):
+            tune(earlier, run)
+    assert {path: path.read_bytes() for path in run.iterdir()} == before
 
 
 def test_an_interrupted_fine_tuning_continues_to_the_same_bits(tuned, quick_run, tmp_path):
