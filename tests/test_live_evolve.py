@@ -82,13 +82,19 @@ def test_a_driver_from_the_page_scores_the_same_in_python(evolved, tmp_path):
     assert score == pytest.approx(page_score, abs=2 * TILE)
 
 
-def test_the_evolved_driver_is_the_rival_in_the_race(evolved, opened):
+def test_the_evolved_driver_is_the_rival_in_the_race_until_an_address_names_another(evolved, opened):
     address = evolved.get_attribute("#race", "href")
     race = opened("race", address[address.index("#") :])
     assert race.input_value("#agent") == "evolved"
     text = address.rpartition("driver=")[2]
     driver = race.evaluate("(text) => [...stad.unpackDriver(text, 32, 256)]", text)
     assert driver == evolved.evaluate("stad.page.states.at(-1).mean")
+    race.evaluate("location.hash = '#track=5&agent=frame'")
+    race.wait_for_function("document.querySelector('#card-title').innerText === 'Beat the agent'")
+    assert race.input_value("#agent") == "frame"
+    race.evaluate("(hash) => { location.hash = hash }", address[address.index("#") :])
+    race.wait_for_function("document.querySelector('#agent').value === 'evolved'")
+    race.wait_for_selector("#live[data-state=ready]")
     race.select_option("#agent", "input")
     assert "driver" not in race.evaluate("location.hash")
 

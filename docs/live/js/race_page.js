@@ -346,6 +346,8 @@ stad.start(async () => {
     set("pause", phase === "paused" ? "Go on" : "Pause");
     get("pause").disabled = phase !== "race" && phase !== "paused";
     get("eyes").disabled = get("auto").disabled = phase !== "race";
+    // A disabled button would keep the keys from the page.
+    if (document.activeElement.disabled) get("seat").focus({ preventScroll: true });
     if (phase !== "race" && phase !== "paused") wake();
     if (phase === "over") [endedAt, touched] = [performance.now(), false];
     if (phase === "over") setAuto(false);
@@ -489,24 +491,26 @@ stad.start(async () => {
     ArrowLeft: "left", ArrowRight: "right", ArrowUp: "gas", ArrowDown: "brake",
     KeyA: "left", KeyD: "right", KeyW: "gas", KeyS: "brake", Space: "brake",
   }; // prettier-ignore
+  const TAKES_KEYS = "select, textarea, input:not([type=checkbox])";
 
   document.addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.altKey || event.metaKey) return;
-    if (event.target.matches("select")) return;
+    if (!state || event.ctrlKey || event.altKey || event.metaKey) return;
+    const { target } = event;
+    // What takes letters or arrow keys itself keeps them.
+    if (target.isContentEditable || target.matches(TAKES_KEYS)) return;
     if (event.key === "Escape") {
       setPaused(true);
       document.activeElement.blur();
       return;
     }
-    const racing = state?.phase === "race" || get("seat").contains(document.activeElement);
+    const racing = state.phase === "race" || get("seat").contains(document.activeElement);
     const free = document.activeElement === document.body; // no other control wants the keys
-    const idle = state?.phase === "attract" && seen && free;
-    if (!racing && !idle) return;
+    if (!racing && !(seen && free)) return;
     if (event.key.toLowerCase() === "p" && !event.repeat)
       return state.phase === "paused" ? wish() : setPaused(true);
     if (event.key.toLowerCase() === "e" && !event.repeat) return toggleEyes();
     const pedal = KEYS[event.code];
-    if (!pedal || (event.code === "Space" && event.target.matches("button, input"))) return;
+    if (!pedal || (event.code === "Space" && target.matches("button, input"))) return;
     event.preventDefault();
     if (event.repeat) return;
     held.set(event.code, pedal);
@@ -565,14 +569,25 @@ stad.start(async () => {
   brake.addEventListener("pointerdown", press(true));
   for (const end of ["pointerup", "pointercancel", "pointerleave"])
     brake.addEventListener(end, press(false));
-  setInterval(() => stad.readGamepad() && (wish(), sendPedals()), 40);
 
-  for (const id of ["card", "race"])
-    get(id).addEventListener("click", ({ pointerType }) => {
-      touching = pointerType === "touch" || pointerType === "pen"; // then gas by itself
+  // A gamepad sends no events. When it is let go, the worker is told that, too.
+  let gripped = false;
+  setInterval(() => {
+    const [was, now] = [gripped, stad.readGamepad() !== null];
+    gripped = now;
+    if (now && !was) wish(); // not while it is held: the reader may have paused since
+    if (now || was) sendPedals();
+  }, 40);
+
+  for (const id of ["card", "race"]) {
+    get(id).addEventListener("pointerdown", ({ pointerType }) => {
+      touching = pointerType !== "mouse"; // not every browser tells it with the click
+    });
+    get(id).addEventListener("click", () => {
       wish();
       sendPedals();
     });
+  }
   get("easy").addEventListener("change", sendPedals);
   get("again").addEventListener("click", begin);
   get("another").addEventListener("click", () => {
@@ -601,8 +616,9 @@ stad.start(async () => {
   addEventListener("hashchange", () => {
     if (!location.hash.includes("track=")) return; // another place of the page
     const asked = readAddress();
-    const texts = [asked, evolved ?? {}].map((one) => stad.packDriver(one.driver ?? []));
-    if (asked.driver && texts[0] !== texts[1]) return location.reload();
+    const [theirs, ours] = [asked.driver, driver].map((one) => stad.packDriver(one ?? []));
+    // An evolved driver belongs to one V, and to the list of rivals.
+    if (theirs !== ours || (driver && asked.agent !== agent)) return location.reload();
     if (asked.agent !== agent) {
       agent = get("agent").value = asked.agent;
       choose(agent).catch(stad.fail);
