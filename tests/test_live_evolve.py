@@ -9,6 +9,18 @@ from stad_lab.io.weights import load_controller
 SMALL = "#seed=3&population=12&agent=frame"
 LOG = """(count) => stad.page.log.slice(0, count).map(({ scores, mean, laps, checksum }) =>
     ({ scores, mean, laps, checksum }))"""
+# Evolutions with other settings, which other links have led to.
+OTHERS = """[4, 5, 4].forEach((seed) => {
+    const settings = { ...stad.evolveSettings.fromAddress(), seed }
+    stad.evolveSettings.keep({ settings, log: [], bet: null })
+})"""
+FAIL_ONCE = """() => {
+    const make = stad.controllerFile
+    stad.controllerFile = async () => {
+        stad.controllerFile = make
+        throw new Error("no download")
+    }
+}"""
 TILE = 1000 / 200  # points; a track has more tiles
 
 
@@ -44,6 +56,7 @@ def evolved(running):
 
 def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
     page, done = evolved, evolved.evaluate("stad.page.log.length")
+    page.evaluate(OTHERS)
     page.reload()
     page.wait_for_selector("#live[data-state=ready]")
     assert page.evaluate("stad.page.log.length") == done
@@ -54,13 +67,28 @@ def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
     page.click("#restart")
     assert "-5" in page.inner_text("#warning")
     page.fill("#seed", "3")
-    page.click("#restart")  # one click asks, so nothing is lost by it
+    page.evaluate(FAIL_ONCE)
+    page.click("#download")
+    page.wait_for_function("document.querySelector('#answer').innerText === 'no download'")
+    page.dblclick("#restart")  # this asks, so nothing is lost by it
     assert f"generation {done + 1}" in page.inner_text("#warning")
     assert page.evaluate("stad.page.log.length") == done + 1
     page.click("#restart")
     page.wait_for_function("stad.page.log.length === 0")
     evolve(page, done + 1)
     assert page.evaluate(LOG, done + 1) == resumed
+
+
+def test_the_latest_few_evolutions_are_kept_and_a_link_goes_on_with_its_own(opened):
+    page = opened("evolve", SMALL)
+    page.evaluate(OTHERS.replace("[4, 5, 4]", "[1, 2, 4, 5, 4]"))
+    kept = page.evaluate("stad.evolveSettings.all.map(({ settings }) => settings.seed)")
+    assert kept == [4, 5, 2]
+    evolve(page, 1)
+    page.evaluate("location.hash = location.hash.replace('seed=3', 'seed=5')")
+    page.wait_for_function("stad.page.log.length === 0")
+    page.evaluate("location.hash = location.hash.replace('seed=5', 'seed=3')")
+    page.wait_for_function("stad.page.log.length === 1")
 
 
 def test_a_driver_from_the_page_scores_the_same_in_python(evolved, tmp_path):
@@ -82,7 +110,7 @@ def test_a_driver_from_the_page_scores_the_same_in_python(evolved, tmp_path):
     assert score == pytest.approx(page_score, abs=2 * TILE)
 
 
-def test_the_evolved_driver_is_the_rival_in_the_race_until_an_address_names_another(evolved, opened):
+def test_the_evolved_driver_is_the_rival_in_the_race_until_an_address_has_none(evolved, opened):
     address = evolved.get_attribute("#race", "href")
     race = opened("race", address[address.index("#") :])
     assert race.input_value("#agent") == "evolved"

@@ -90,6 +90,21 @@ stad.start(async () => {
     return beginning;
   }
 
+  /** Go on with what was kept, or begin afresh, with the settings in the address. */
+  async function open() {
+    const address = location.hash;
+    const kept = stad.evolveSettings.kept();
+    const first = kept?.settings ?? stad.evolveSettings.fromAddress();
+    bet = kept?.bet ?? null;
+    try {
+      await restart(first, kept?.log);
+      get("answer").textContent ||= stad.evolveSettings.ignored(address);
+    } catch (error) {
+      await restart(first);
+      get("answer").textContent = error.message;
+    }
+  }
+
   /** Give the workers V and, if C sees its memory, M. */
   async function chooseNetworks() {
     const { agent, sees } = settings;
@@ -157,13 +172,14 @@ stad.start(async () => {
 
   let saved = 0; // generations of the driver that was downloaded last
   async function download() {
-    saved = log.length;
+    const generation = log.length; // another one may end meanwhile
     const parameters = stad.expandController(states.at(-1).mean, Z, H);
-    const facts = { ...identity, generation: log.length, seed: settings.seed };
+    const facts = { ...identity, generation, seed: settings.seed };
     const link = document.createElement("a");
     link.href = URL.createObjectURL(await stad.controllerFile(parameters, facts));
     link.download = "driver.safetensors";
     link.click();
+    saved = generation;
     setTimeout(() => URL.revokeObjectURL(link.href), 10_000); // when it has been saved
   }
 
@@ -173,7 +189,8 @@ stad.start(async () => {
   });
   get("step").addEventListener("click", () => go(driving ? 0 : 1)); // or no more than this one
   // A driver that took minutes is not thrown away by one click.
-  get("restart").addEventListener("click", () => {
+  get("restart").addEventListener("click", ({ detail }) => {
+    if (detail > 1) return; // a double click does not answer the question
     const wrong = stad.evolveSettings.wrong();
     const sure = log.length === saved || get("restart").dataset.asked === "true";
     get("warning").textContent =
@@ -204,20 +221,10 @@ stad.start(async () => {
   addEventListener("hashchange", () => {
     const asked = stad.evolveSettings.fromAddress();
     if (stad.evolveSettings.asked && !stad.evolveSettings.equal(asked, settings))
-      restart(asked).catch(stad.fail);
+      open().catch(stad.fail);
   });
 
-  const asked = location.hash;
-  const kept = stad.evolveSettings.kept();
-  const first = kept?.settings ?? stad.evolveSettings.fromAddress();
-  bet = kept?.bet ?? bet;
-  try {
-    await restart(first, kept?.log);
-    get("answer").textContent ||= stad.evolveSettings.ignored(asked);
-  } catch (error) {
-    await restart(first);
-    get("answer").textContent = error.message;
-  }
+  await open();
   stad.page = {
     view,
     get log() { return log; },

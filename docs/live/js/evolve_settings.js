@@ -4,6 +4,7 @@ globalThis.stad ??= {};
 
 stad.evolveSettings = {
   KEY: "stad-evolve", // in the browser's storage
+  LATEST: 3, // evolutions that are kept, each with settings of its own
   SEED: /^\d{1,9}$/,
   NAMES: ["population", "sigma", "decay", "tracks", "sees", "agent", "seed"],
 
@@ -61,21 +62,30 @@ stad.evolveSettings = {
     return this.NAMES.every((name) => one[name] === other?.[name]);
   },
 
-  keep(state) {
+  /** The evolutions that were kept, the latest one first. */
+  get all() {
     try {
-      localStorage.setItem(this.KEY, JSON.stringify(state));
+      return [JSON.parse(localStorage.getItem(this.KEY)) ?? []].flat(); // once it was a single one
     } catch {
-      // without storage, or when it is full, nothing is kept
+      return [];
     }
   },
 
-  /** What was kept, if it has these settings, or if the address asks for none. */
+  /** Keep an evolution in the place of an earlier one with the same settings. */
+  keep(state) {
+    const others = this.all.filter(({ settings }) => !this.equal(settings, state.settings));
+    for (let count = this.LATEST; count > 0; count--)
+      try {
+        const latest = [state, ...others].slice(0, count);
+        return localStorage.setItem(this.KEY, JSON.stringify(latest));
+      } catch {
+        // when the storage is full, fewer are kept, and without it none is
+      }
+  },
+
+  /** The evolution that was kept with the settings in the address, or the latest one. */
   kept() {
-    try {
-      const kept = JSON.parse(localStorage.getItem(this.KEY));
-      return !this.asked || this.equal(this.fromAddress(), kept.settings) ? kept : null;
-    } catch {
-      return null;
-    }
+    if (!this.asked) return this.all[0];
+    return this.all.find(({ settings }) => this.equal(this.fromAddress(), settings));
   },
 };
