@@ -189,8 +189,11 @@ def test_cma_es_on_the_page_can_be_begun_stepped_by_keyboard(opened):
     assert "Generation 0" in page.inner_text("#state")
     page.keyboard.press("Enter")
     assert "Generation 1" in page.inner_text("#state")
+    page.focus("#step")
     page.evaluate("for (let n = 0; n < 99; n++) stad.get('step').click()")
     assert "at the lowest point" in page.inner_text("#state")
+    page.wait_for_timeout(50)
+    assert page.evaluate("document.activeElement.id") == "step"
     page.click("#plane", position={"x": 20, "y": 20})
     assert "Generation 0" in page.inner_text("#state")
 

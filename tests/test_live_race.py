@@ -168,6 +168,49 @@ def test_the_bend_that_the_agent_leaves_is_driven_live(opened):
     marks = figure.locator("[data-part=map]")
     for _ in range(10):
         marks.press("ArrowLeft")
-    figure.locator("[data-part=go]").click()
+    go = figure.locator("[data-part=go]")
+    go.click()
+    go.click()
+    assert go.inner_text() == "Go on"
+    for name in ("study", "hairpin"):  # a pause lasts while the reader looks elsewhere
+        show = "(one) => one.scrollIntoView({ block: 'center' })"
+        page.locator(f"[data-figure={name}]").evaluate(show)
+        page.wait_for_timeout(100)
+    assert go.inner_text() == "Go on"
+    go.click()
     page.wait_for_function("document.querySelector('[data-figure=hairpin] strong').textContent")
     assert "689 points" in figure.locator("[data-part=answer]").inner_text()
+
+
+SHORT_DREAMS = """() => {
+    const { step } = stad.Dream.prototype
+    stad.Dream.prototype.step = function (action) {
+        step.call(this, action)
+        this.frames += 99
+    }
+}"""
+COUNT_DRIVES = """() => {
+    const drive = stad.inBackground
+    globalThis.drives = 0
+    stad.inBackground = (work) => (drives++, drive(work))
+}"""
+
+
+def test_the_button_of_the_dreams_says_what_it_does(opened):
+    page = opened("story")
+    figure = page.locator("[data-figure=dream]")
+    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
+    page.wait_for_selector("[data-figure=dream][data-state=ready]")
+    play, again = (figure.locator(f"[data-part={name}]") for name in ("play", "again"))
+    figure.locator("[data-part=bets] button").first.click()
+    play.get_by_text("Pause").wait_for()
+    play.click()
+    assert play.inner_text() == "Go on"
+    page.evaluate(COUNT_DRIVES)
+    again.evaluate("(button) => [button.click(), button.click()]")
+    play.get_by_text("Pause").wait_for()
+    assert page.evaluate("drives") == 1  # there is one car
+    page.evaluate(SHORT_DREAMS)
+    play.get_by_text("Again").wait_for()
+    play.click()
+    page.wait_for_function("drives === 2")

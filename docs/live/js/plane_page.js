@@ -60,7 +60,7 @@
     stad.get("state").textContent = text;
     const at = strategy.mean.map((value) => value.toFixed(2)).join(", ");
     stad.describe(plane, `${landscape.name}, from above. ${text} The mean is at ${at}.`);
-    stad.get("step").disabled = finished();
+    stad.get("step").setAttribute("aria-disabled", finished()); // not `disabled`: the focus stays
     if (finished()) stop();
   }
 

@@ -50,13 +50,15 @@
     const BOUNDS = [50, 150]; // frames between the three answers
     const LONGEST = 400; // frames of a dream
     let [dreams, seed, wanted, over] = [[], 1, true, false];
-    let bet = null;
+    let [bet, driving] = [null, false]; // driving: the car is on its way to the instant
 
     const clock = new stad.Clock(step, draw);
 
     async function restart() {
       clock.pause();
+      driving = true;
       await approach();
+      driving = false;
       dreams = canvases.map(() => ({ dream: dreamOf(seed++), apart: 0, parted: null }));
       for (const { dream } of dreams) dream.temperature = Number(part("temperature").value);
       over = false;
@@ -65,12 +67,22 @@
       draw();
     }
 
+    async function again() {
+      if (driving) return; // there is one car
+      part("answer").textContent = "";
+      await restart();
+      wanted = true;
+      clock.play();
+      showPlay();
+    }
+
     function step() {
       for (const { dream } of dreams) dream.step(act(dream));
       if (!car.over) car.step(agent.act(car.frame()));
       if (dreams[0].dream.frames >= LONGEST || car.over) {
         over = true;
         clock.pause();
+        showPlay();
       }
     }
 
@@ -111,29 +123,25 @@
       ...names.map((name, choice) => {
         const button = document.createElement("button");
         [button.type, button.textContent] = ["button", name];
-        button.addEventListener("click", async () => {
+        button.addEventListener("click", () => {
           if (!part("after").hidden) return; // the first bet counts
           bet = { choice };
           button.setAttribute("aria-pressed", "true");
           part("after").hidden = false;
-          await restart();
-          [wanted] = [true];
-          clock.play();
+          again();
         });
         return button;
       }),
     );
-    part("again").addEventListener("click", async () => {
-      part("answer").textContent = "";
-      await restart();
-      [wanted] = [true];
-      clock.play();
-      showPlay();
-    });
-    const showPlay = () => (part("play").textContent = clock.running ? "Pause" : "Go on");
+    part("again").addEventListener("click", again);
+    function showPlay() {
+      part("play").textContent = clock.running ? "Pause" : over ? "Again" : "Go on";
+    }
     part("play").addEventListener("click", () => {
+      if (driving) return; // the dream begins by itself
+      if (over) return again();
       wanted = !clock.running;
-      if (wanted && !over) clock.play();
+      if (wanted) clock.play();
       else clock.pause();
       showPlay();
     });
@@ -145,7 +153,7 @@
     const begun = () => !part("after").hidden;
     return {
       run(on) {
-        if (on && wanted && begun() && !over) clock.play();
+        if (on && wanted && begun() && !over && !driving) clock.play();
         else clock.pause();
         showPlay();
       },

@@ -8,6 +8,7 @@ stad.figure("hairpin", async (part) => {
   const line = stad.middleLine(track);
   const WIDE = 20 / 3; // half the width of the road
   let [mark, path, lost, over, begun] = [null, [], [], false, false];
+  let wanted = false; // whether the reader wants the car to drive
   car.reset(track);
   agent.reset();
 
@@ -100,8 +101,9 @@ stad.figure("hairpin", async (part) => {
       agent.reset();
     }
     begun = true;
-    if (clock.running) clock.pause();
-    else clock.play();
+    wanted = !clock.running;
+    if (wanted) clock.play();
+    else clock.pause();
     showGo();
   });
   function showGo() {
@@ -112,7 +114,7 @@ stad.figure("hairpin", async (part) => {
   draw();
   return {
     run(on) {
-      if (on && begun && !over) clock.play();
+      if (on && wanted && !over) clock.play();
       else clock.pause();
       showGo();
     },
