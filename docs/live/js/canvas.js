@@ -38,6 +38,25 @@ stad.fillDot = (context, [x, y], radius, color) => {
   context.fill();
 };
 
+/**
+ * Draw numbers as bars, up and down from the middle.
+ * @param {HTMLCanvasElement} canvas
+ * @param {Float32Array} values
+ * @param {number} reach the value that fills half the height
+ * @param {(i: number) => string} color of the bar of number i
+ */
+stad.drawBars = (canvas, values, reach, color) => {
+  const cleared = stad.clearCanvas(canvas);
+  if (!cleared) return;
+  const { context, width, height } = cleared;
+  const step = width / values.length;
+  values.forEach((value, i) => {
+    const tall = Math.max(-1, Math.min(1, value / reach)) * (height / 2 - 2);
+    context.fillStyle = color(i);
+    context.fillRect(i * step + 1, height / 2, Math.max(1, step - 2), -tall || 1);
+  });
+};
+
 /** A function from world units to pixels of a square map that holds all of these points. */
 stad.projectMap = (points, width, margin = 14) => {
   const [xs, ys] = [0, 1].map((axis) => points.map((point) => point[axis]));

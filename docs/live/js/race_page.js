@@ -79,10 +79,7 @@ stad.start(async () => {
     found.kerbTiles.forEach((tile, i) =>
       polygon(layersOf(tile)[3 + (tile % 2)].path, found.kerbs, i),
     );
-    const line = Array.from({ length: found.count }, (_, i) => [
-      found.path[4 * i + 2],
-      found.path[4 * i + 3],
-    ]);
+    const line = stad.middleLine(found);
     const [xs, ys] = [line.map(([x]) => x), line.map(([, y]) => y)];
     const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
     return { ...found, pieces, line, box };
@@ -291,26 +288,13 @@ stad.start(async () => {
   }
 
   function showSeen({ frame, earlier, z, decoded }) {
-    const scaled = (bytes) => Float32Array.from(bytes, (value) => value / 255);
-    const [now, then] = [scaled(frame), scaled(earlier)];
+    const [now, then] = [frame, earlier].map(stad.scaleFrame);
     const dreams = state.asleep && state.phase !== "over";
     stad.paintFrame(get("frame"), now);
     stad.paintDifference(get("difference"), stad.differenceImage(now, then));
     stad.paintFrame(get("decoded"), decoded);
     if (dreams) stad.paintFrame(get("dreamed"), decoded);
-    drawBars(z);
-  }
-
-  function drawBars(z) {
-    const cleared = stad.clearCanvas(get("bars"));
-    if (!cleared) return;
-    const { context, width, height } = cleared;
-    const step = width / z.length;
-    z.forEach((value, i) => {
-      const size = Math.max(-1, Math.min(1, value / 3)) * (height / 2 - 2);
-      context.fillStyle = asleep ? PURPLE : BLUE;
-      context.fillRect(i * step + 1, height / 2, Math.max(1, step - 2), -size);
-    });
+    stad.drawBars(get("bars"), z, 3, () => (asleep ? PURPLE : BLUE));
   }
 
   // --- Words --------------------------------------------------------------------------------------

@@ -65,15 +65,8 @@ stad.figure("eye", async (part) => {
   }
 
   function drawBars() {
-    const cleared = stad.clearCanvas(part("bars"));
-    if (!cleared) return;
-    const { context, width, height } = cleared;
-    const step = width / z.length;
-    z.forEach((value, i) => {
-      const tall = Math.max(-1, Math.min(1, value / REACH)) * (height / 2 - 2);
-      context.fillStyle = chosen.includes(i) ? "#E69F00" : "#56B4E9";
-      context.fillRect(i * step + 1, height / 2, Math.max(1, step - 2), -tall || 1);
-    });
+    const color = (i) => (chosen.includes(i) ? "#E69F00" : "#56B4E9");
+    stad.drawBars(part("bars"), z, REACH, color);
   }
 
   stad.bet(part("bets"), ["The bend", "The squares in the grass", "The edge of the road"], () => {
