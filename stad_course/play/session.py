@@ -16,6 +16,7 @@ import torch
 from stad_lab.agent import Agent
 from stad_lab.config import TRACK_RANGES
 from stad_lab.dreaming import Dreamer
+from stad_lab.envs.arguments import choice
 from stad_lab.envs.car_racing import CarRacing, make_env
 from stad_lab.envs.dream import DreamEnv
 from stad_lab.evaluation.trajectories import Trajectory, true_motion
@@ -40,12 +41,6 @@ def on_one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raise ValueError unless a value is one of the choices."""
-    if value not in choices:
-        raise ValueError(f"{name} {value!r}: expected one of {', '.join(choices)}")
-
-
 def pose_of(car: np.ndarray) -> tuple[float, float, float]:
     """Position (world units) and heading (radians) of the hull of a `physics.CAR`."""
     return (*car["position"][0].tolist(), float(car["angle"][0]))
@@ -61,7 +56,7 @@ class Hand:
     def hold(self, *pedals: str) -> None:
         """Hold these of PEDALS and release all others. ValueError for another name."""
         for pedal in pedals:
-            check_choice("pedal", pedal, PEDALS)
+            choice("pedal", pedal, PEDALS)
         self.held = set(pedals)
 
     def act(self) -> np.ndarray:
@@ -153,13 +148,13 @@ class Session:
 
     def give(self, driver: str) -> None:
         """Let "hand" or "agent" drive (ValueError for others), from the last action on."""
-        check_choice("driver", driver, DRIVERS)
+        choice("driver", driver, DRIVERS)
         self.driver = driver
 
     @on_one_thread()
     def enter(self, world: str) -> None:
         """Continue on the "real" track, or in a new "dream" of its frame; else ValueError."""
-        check_choice("world", world, WORLDS)
+        choice("world", world, WORLDS)
         if world == "dream":
             options = {"latents": self.agent.latents[0], "state": to_state(self.before)}
             self.latents, _ = self.dream.reset(seed=self.track, options=options)

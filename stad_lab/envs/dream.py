@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from stad_lab.envs.arguments import check_options, choice, finite_array, shown, whole_number
+from stad_lab.envs.car_racing import action_space
 from stad_lab.models.controller import ACTION_SIZE
 from stad_lab.models.mdn_rnn import MDNRNN, check_temperature
 from stad_lab.models.vae import VAE, to_uint8
@@ -49,8 +50,7 @@ class DreamEnv(gym.Env):
         self.vae, self.mdn_rnn = vae, mdn_rnn
         self.temperature, self.max_frames, self.render_mode = temperature, max_frames, render_mode
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (vae.latent_size,), np.float32)
-        lowest = np.array([-1, 0, 0], np.float32)
-        self.action_space = gym.spaces.Box(lowest, np.ones(ACTION_SIZE, np.float32))
+        self.action_space = action_space()
         self.latents: torch.Tensor = None  # type: ignore[assignment]  # until reset
 
     def reset(

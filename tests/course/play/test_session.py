@@ -108,11 +108,11 @@ def test_an_ended_episode_cannot_go_on_and_earlier_episodes_are_kept(session):
 def test_what_does_not_exist_is_refused(session):
     with pytest.raises(ValueError, match="track=-1: expected a whole number from 0 to 999,999"):
         session.begin(-1)
-    with pytest.raises(ValueError, match="driver 'dog': expected one of hand, agent"):
+    with pytest.raises(ValueError, match="driver='dog': choose one of hand, agent"):
         session.give("dog")
-    with pytest.raises(ValueError, match="world 'mars': expected one of real, dream"):
+    with pytest.raises(ValueError, match="world='mars': choose one of real, dream"):
         session.enter("mars")
-    with pytest.raises(ValueError, match="pedal 'clutch'"):
+    with pytest.raises(ValueError, match="pedal='clutch'"):
         session.hand.hold("gas", "clutch")
     with pytest.raises(ValueError, match="at least one frame first"):
         session.trajectory()
