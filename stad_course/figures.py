@@ -12,14 +12,12 @@ from stad_lab.viz.plots import (
     ORANGE,
     RED,
     SKY,
-    SMALL,
     STYLES,
     THIN,
     caption,
     describe,
     legend_below,
     new_figure,
-    show_picture,
 )
 
 
@@ -66,7 +64,7 @@ def plot_mixture(
         weights /= weights.sum()
         sigma = np.exp(logsigma) * np.sqrt(temperature)
         gaussians = gaussian(z[:, None], mean, sigma)
-        label = f"temperature {temperature:g}"
+        label = f"temperature {temperature:g}" if len(temperatures) > 1 else "M's mixture"
         axis.plot(z, gaussians @ weights, dash, color=color, lw=2, label=label)
         if len(temperatures) == 1:
             axis.plot(z, weights * gaussians, **THIN)
@@ -85,39 +83,6 @@ def plot_mixture(
 def gaussian(z: np.ndarray, mean: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """The density of normal distributions at z; the arrays are broadcast together."""
     return np.exp(-0.5 * ((z - mean) / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma)
-
-
-def plot_dream(
-    real: np.ndarray,
-    dream: np.ndarray,
-    moment: int,
-    name: str,
-    steps: np.ndarray,
-    errors: dict[str, np.ndarray],
-) -> Figure:
-    """A moment of an episode beside its dream, and how far dreams are from reality by then.
-
-    Args:
-        real, dream: uint8 (T, 64, 64, 3) from the same moment on.
-        moment: the frame to show, from 0.
-        name: of the dream.
-        steps: of `errors`, 1 for the first dreamed frame.
-        errors: name -> error at these steps, 1 for that of the average picture.
-    """
-    figure, axes = new_figure(9.4, 3.0, 1, 3, width_ratios=[1, 1, 1.7])
-    for axis, picture, title in zip(axes[0], (real, dream), ("real", name), strict=False):
-        show_picture(axis, picture[moment])
-        caption(axis, title)
-    axis = axes[0, 2]
-    for (way, values), (color, dash) in zip(errors.items(), STYLES, strict=False):
-        axis.plot(steps, values, dash, color=color, label=way)
-    axis.axhline(1, **THIN)
-    axis.axvline(moment + 1, color="black", lw=1.5)
-    axis.set(xlabel="steps dreamed", ylabel="error (average picture = 1)", ylim=(0, None))
-    axis.legend(**SMALL, loc="lower right")
-    title = f"Step {moment + 1} of a dream ({(moment + 1) / 50:.1f} seconds)"
-    now = [f"{way} {np.interp(moment + 1, steps, own):.2f}" for way, own in errors.items()]
-    return describe(figure, title, "Real frame, dreamed frame, and errors at this step: ", now)
 
 
 def plot_cma_es(
