@@ -53,7 +53,7 @@ def test_the_pedals_that_the_page_sends_are_held_and_others_are_refused(make_sea
     assert seat.session.hand.held == {"left"}
     seat.wire.value = ""
     assert seat.session.hand.held == set()
-    with pytest.raises(ValueError, match="pedal 'clutch'"):
+    with pytest.raises(ValueError, match="pedal='clutch'"):
         seat.wire.value = "clutch"
 
 
