@@ -25,6 +25,7 @@ from stad_course.compete.child import PROCESSES
 from stad_course.compete.limits import Limits
 from stad_course.compete.protocol import receive, send
 
+MAKING = threading.Lock()
 PAUSE = 0.05  # seconds between two looks of the watchdog
 LARGEST_SUBMISSION = 300_000_000  # bytes
 LOWEST, HIGHEST = (-1.0, 0.0, 0.0), (1.0, 1.0, 1.0)  # steering, gas and brake
@@ -68,9 +69,15 @@ def environment(home: str | Path) -> dict[str, str]:
 
 
 @functools.cache
-def shared_folder() -> tempfile.TemporaryDirectory:
-    """In which the folders of all submissions lie, until this process ends: each sees its own."""
+def temporary_folder() -> tempfile.TemporaryDirectory:
+    """A folder that lasts as long as this process."""
     return tempfile.TemporaryDirectory(prefix="stad_lab-")
+
+
+def shared_folder() -> str:
+    """In which the folders of all submissions lie: each sees its own."""
+    with MAKING:  # of two that two threads make, one would be removed at once
+        return temporary_folder().name
 
 
 class Submission:
@@ -94,7 +101,7 @@ class Submission:
         self.limits, self.used, self.hidden = limits, used, hidden
         self.deadline, self.bound = float("inf"), ""  # of the answer that is awaited
         self.broken, self.fresh = "", True
-        self.folder = Path(tempfile.mkdtemp(dir=shared_folder().name)).resolve()
+        self.folder = Path(tempfile.mkdtemp(dir=shared_folder())).resolve()
         try:
             self.process = self._start(copied(path, self.folder))
             threading.Thread(target=self._watch, daemon=True).start()
