@@ -119,6 +119,7 @@ def test_the_evolved_driver_is_the_rival_in_the_race_until_an_address_has_none(e
     assert driver == evolved.evaluate("stad.page.states.at(-1).mean")
     race.evaluate("location.hash = '#track=5&agent=frame'")
     race.wait_for_function("document.querySelector('#card-title').innerText === 'Beat the agent'")
+    race.wait_for_selector("#live[data-state=ready]")  # or it would not notice the next address
     assert race.input_value("#agent") == "frame"
     race.evaluate("(hash) => { location.hash = hash }", address[address.index("#") :])
     race.wait_for_function("document.querySelector('#agent').value === 'evolved'")

@@ -109,6 +109,7 @@ INTERRUPTED = """
 import random, signal, time
 from stad_lab.io.workers import run_tasks, worker_threads
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's "&" lets it be ignored
 signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
 for number in range(600):
     try:

@@ -100,6 +100,7 @@ def test_a_film_shows_one_frame_of_three(agent):
 
 def test_an_interrupt_within_a_figure_ends_the_training_once_the_figure_is_drawn(capsys):
     drawn = []
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's "&" lets it be ignored
 
     def draw(entries):
         signal.raise_signal(signal.SIGINT)
