@@ -134,14 +134,8 @@ def comparisons_table(study: dict) -> str:
             cells = (family, f"`{variant}`, {SEEN[features]}", difference_of(one))
             cells += (f"{low:.1f} to {high:.1f}", f"{one['deviation']:.0f}")
             lines.append((*cells, *(p_value(one[key]) for key in ("p", "holm_p")), outcome))
-    head = (
-        "test",
-        "variant less `frame`",
-        "difference (95% interval)",
-        "t-interval",
-        "SD of pairs",
-    )
-    return table((*head, "p", "Holm's p", "verdict"), lines)
+    head = ("test", "variant less `frame`", "difference (95% interval)", "t-interval")
+    return table((*head, "SD of pairs", "p", "Holm's p", "verdict"), lines)
 
 
 def p_value(p: float) -> str:

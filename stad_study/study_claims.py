@@ -139,12 +139,13 @@ def leave_one_out(returns: dict[str, np.ndarray]) -> dict[str, list[str]]:
     are Student's, because the bootstrap's end close to the margin changes with the resamples.
     """
     found: dict[str, list[str]] = {features: [] for features in FEATURES}
-    for seed in range(len(next(iter(returns.values())))):
-        others = {arm: np.delete(own, seed, axis=0) for arm, own in returns.items()}
-        ones = [compare(others[f"{f}: frame"], others[f"{f}: input_output"]) for f in FEATURES]
-        adjusted = statistics.holm([one["p"] for one in ones])
-        for features, one, p in zip(FEATURES, ones, adjusted, strict=True):
-            found[features].append(find_verdict(one["t_interval"], p))
+    gains = [returns[f"{f}: input_output"] - returns[f"{f}: frame"] for f in FEATURES]
+    by_seed = [gain.mean(axis=1) for gain in gains]
+    for seed in range(len(by_seed[0])):
+        others = [np.delete(own, seed) for own in by_seed]
+        adjusted = statistics.holm([statistics.paired_p(own) for own in others])
+        for features, own, p in zip(FEATURES, others, adjusted, strict=True):
+            found[features].append(find_verdict(statistics.mean_interval(own), p))
     return found
 
 
