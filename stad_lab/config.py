@@ -349,7 +349,8 @@ PRESETS = {
     "laptop": Config(),
     # The budget that the paper states, with World Models' sizes and loss, and its passes over the
     # data: one for V, twenty for M. The paper does not say how many episodes a candidate drives.
-    # Four are the fewest with which `frame` came near its score (study 2 of docs/protocol.md).
+    # With one `frame` stayed far below its score, with four it came near (study 2 of
+    # docs/protocol.md).
     "paper": Config(
         data=DataConfig(episodes=1000, episode_frames=1000, random_starts=0.0),
         vae=VAEConfig(width=32, kl_weight=1.0, free_bits=0.5, steps=10000, batch=100),
