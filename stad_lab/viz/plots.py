@@ -247,7 +247,6 @@ def plot_returns(returns: dict[str, np.ndarray], title: str, paired: bool = Fals
         axis.scatter(values, heights, 12, color, alpha=0.6)
         axis.plot([mean] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
         axis.text(1.01, row, f"mean {mean:.0f}", transform=axis.get_yaxis_transform(), **text)
-    axis.axvline(SOLVED, **THIN)
     axis.set_xlabel("return of an episode")
     name_rows(axis, returns)
     means = (f"{name} mean {values.mean():.0f}" for name, values in returns.items())

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from stad_lab.evaluation.metrics import region_masks
 
@@ -43,15 +42,3 @@ def test_without_memory_m_loses_most_and_a_dream_turns_with_the_wheel():
     last = [region_masks(film[-1:])["road"][0, :45] for film in names["turns"].values()]
     left, _, right = (np.nonzero(road)[1].mean() for road in last)  # columns of the road
     assert left > right
-
-
-def test_a_step_of_the_memory_as_the_lesson_writes_it_is_that_of_pytorch():
-    names = names_after("03", "02", "03", "26")
-    network, step = names["mdn_rnn"], names["lstm_step"]
-    generator = torch.Generator().manual_seed(0)
-    z, actions = (torch.randn(20, size, generator=generator) for size in (32, 3))
-    h = c = torch.zeros(network.hidden_size)
-    for one in zip(z, actions, strict=True):
-        h, c = step(*one, h, c)
-    _, (theirs, _) = network.remember(z[None], actions[None])
-    assert torch.allclose(h, theirs[0, 0], atol=1e-5)
