@@ -42,6 +42,7 @@ def describe_study1(folder: Path = tables.DATA) -> dict:
     found |= {"arms": arms, "comparisons": comparisons}
     found |= {"afterwards": compare_afterwards(returns)}
     found |= {"verdicts_without_a_seed": leave_one_out(returns)}
+    found |= {"equivalence": describe_equivalence(returns)}
     return found | {"curves": bands, "curve_differences": curve_differences(curves)}
 
 
@@ -146,6 +147,27 @@ def leave_one_out(returns: dict[str, np.ndarray]) -> dict[str, list[str]]:
         adjusted = statistics.holm([statistics.paired_p(own) for own in others])
         for features, own, p in zip(FEATURES, others, adjusted, strict=True):
             found[features].append(find_verdict(statistics.mean_interval(own), p))
+    return found
+
+
+def describe_equivalence(returns: dict[str, np.ndarray]) -> dict[str, dict]:
+    """Features -> two one-sided t-tests of `input_output` - `frame` against the margin.
+
+    The protocol asks for a 95% interval within the margin; these tests, as is usual, for one of
+    90%. "stays" counts the seeds without which they still reject.
+    """
+    found = {}
+    for features in FEATURES:
+        by_seed = (returns[f"{features}: input_output"] - returns[f"{features}: frame"]).mean(
+            axis=1
+        )
+        without = [np.delete(by_seed, seed) for seed in range(len(by_seed))]
+        stays = sum(statistics.equivalence_p(own, MARGIN) < LEVEL for own in without)
+        found[features] = {
+            "interval_90": statistics.mean_interval(by_seed, 0.1),
+            "p": statistics.equivalence_p(by_seed, MARGIN),
+            "stays": stays,
+        }
     return found
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from safetensors.numpy import load_file, save
 
 from stad_study.study_claims import MARGIN
+from stad_study.verdict import PAPER_GAIN
 
 HERE = Path(__file__).parent
 PRETRAINED = HERE.parents[1] / "stad_lab" / "pretrained"
@@ -81,7 +82,7 @@ def study() -> dict[str, object]:
         one = comparisons[f"{features}: input_output"]
         pairs = {"interval": one["interval"], "pairs": one["by_seed"]}
         rows.append({"name": name, "difference": one["difference"], **pairs})
-    return {"rows": rows, "margin": MARGIN}
+    return {"rows": rows, "margin": MARGIN, "paper": PAPER_GAIN}
 
 
 def data() -> dict[str, object]:

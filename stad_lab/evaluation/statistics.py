@@ -56,6 +56,16 @@ def paired_p(differences: Sequence[float] | np.ndarray) -> float:
     return float(stats.ttest_1samp(differences, 0.0).pvalue)
 
 
+def equivalence_p(differences: Sequence[float] | np.ndarray, margin: float) -> float:
+    """P-value of equivalence: the larger of two one-sided t-tests, against each end of +-margin.
+
+    It is below 0.05 if Student's 90% interval lies within the margin (Schuirmann 1987).
+    """
+    above = stats.ttest_1samp(differences, -margin, alternative="greater").pvalue
+    below = stats.ttest_1samp(differences, margin, alternative="less").pvalue
+    return float(max(above, below))
+
+
 def mean_interval(values: Sequence[float] | np.ndarray, outside: float = 0.05) -> list[float]:
     """Student's interval of the mean of two values or more; half of `outside` on each side."""
     error = stats.sem(values)

@@ -2,7 +2,7 @@
 // "Does looking at change help?": a bet, then the twelve pairs and the intervals of study 1.
 
 stad.figure("study", async (part) => {
-  const { rows, margin } = await stad.load("study");
+  const { rows, margin, paper } = await stad.load("study");
   const [LOW, HIGH] = [-115, 130]; // points
   let shown = false;
 
@@ -17,6 +17,11 @@ stad.figure("study", async (part) => {
     context.fillStyle = faint;
     context.fillRect(x(-margin), 0, x(margin) - x(-margin), height - 22);
     stad.strokeLine(context, [[x(0), 0], [x(0), height - 22]], ink, 1); // prettier-ignore
+    if (shown) {
+      context.setLineDash([5, 4]);
+      stad.strokeLine(context, [[x(paper), 0], [x(paper), height - 22]], ink, 1); // prettier-ignore
+      context.setLineDash([]);
+    }
     context.fillStyle = ink;
     context.textAlign = "center";
     for (const points of [-100, -50, 0, 50, 100]) context.fillText(points, x(points), height - 6);
@@ -37,12 +42,13 @@ stad.figure("study", async (part) => {
   stad.bet(part("bets"), names, () => {
     shown = true;
     draw();
-    const text = rows.map(({ name, difference, interval }) => `${name}: ${difference.toFixed(1)} points (95% interval ${interval.map((end) => end.toFixed(1)).join(" to ")})`).join(". "); // prettier-ignore
+    const found = rows.map(({ name, difference, interval }) => `${name}: ${difference.toFixed(1)} points (95% interval ${interval.map((end) => end.toFixed(1)).join(" to ")})`).join(". "); // prettier-ignore
+    const text = `${found}. The paper: ${paper} points`;
     part("answer").textContent =
-      "With its memory, no gain was found that matters. Without it, there is one: see below.";
+      "With its memory, no gain was found that matters. Without it, a gain was found: see below.";
     stad.describe(part("chart"), text);
     stad.announce(text);
-    part("after").hidden = false;
+    part("after").hidden = part("paper").hidden = false;
     return 0;
   });
   new ResizeObserver(draw).observe(part("chart"));
