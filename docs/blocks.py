@@ -86,8 +86,8 @@ def gains(claims: dict) -> str:
     differ = describe_interaction(study["afterwards"]["interaction"])
     text = (
         "Does it help to see and reconstruct what has moved? A paper says so. In our study of"
-        f" twelve pairs it adds {alone} where the controller does not see the memory, and {both}"
-        f" where it does (95% intervals). {differ}"
+        f" twelve pairs it adds {both} if the controller sees the memory, as we read the paper, and"
+        f" {alone} if it does not (95% intervals). {differ}"
     )
     return text.replace(" -0 ", " 0 ")
 

@@ -21,13 +21,14 @@ import numpy as np
 import psutil
 
 import stad_lab
-from stad_course.compete.child import PROCESSES
+from stad_course.compete.child import AGENT_FILE, PROCESSES
 from stad_course.compete.limits import Limits
 from stad_course.compete.protocol import receive, send
 
 MAKING = threading.Lock()
 PAUSE = 0.05  # seconds between two looks of the watchdog
 LARGEST_SUBMISSION = 300_000_000  # bytes
+DATASET = "dataset"  # the folder of a trained run that its agent does not need
 LOWEST, HIGHEST = (-1.0, 0.0, 0.0), (1.0, 1.0, 1.0)  # steering, gas and brake
 UNSHARE = ["unshare", "--user", "--map-root-user", "--net", "--ipc", "--mount", "--pid", "--fork"]
 UNSHARE += ["--kill-child", "--mount-proc"]
@@ -248,14 +249,21 @@ class Submission:
 
 
 def copied(path: Path, folder: Path) -> Path:
-    """A copy of a submission in a folder. Failure if it is too large."""
+    """A copy of a submission in a folder, without a run's dataset. Failure if it is too large."""
+    target = folder / path.resolve().name
+    is_run = path.is_dir() and not (path / AGENT_FILE).exists()
     files = [path] if path.is_file() else [one for one in path.rglob("*") if one.is_file()]
+    if is_run:
+        files = [one for one in files if not one.is_relative_to(path / DATASET)]
     size = sum(one.lstat().st_size for one in files)
     if size > LARGEST_SUBMISSION:
         raise Failure(
             f"it has {size / 1e6:.0f} MB, at most {LARGEST_SUBMISSION / 1e6:.0f} are read"
         )
-    target = folder / path.resolve().name
     if path.is_file():
         return Path(shutil.copyfile(path, target))
-    return Path(shutil.copytree(path, target, symlinks=True))
+
+    def left_out(parent: str, _: list[str]) -> list[str]:
+        return [DATASET] if is_run and Path(parent) == path else []
+
+    return Path(shutil.copytree(path, target, symlinks=True, ignore=left_out))

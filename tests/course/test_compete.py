@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 import zlib
 
@@ -19,9 +20,10 @@ from stad_course.compete.drive import (
     drive_batch,
 )
 from stad_course.compete.limits import Limits
-from stad_course.compete.process import Submission, can_isolate
+from stad_course.compete.process import LARGEST_SUBMISSION, Failure, Submission, can_isolate, copied
 from stad_course.compete.ranking import rank
 from stad_course.compete.tracks import hide_tracks
+from stad_lab.agent import PRETRAINED
 from stad_lab.envs.cars import Cars
 from stad_lab.io.files import load_json
 
@@ -52,6 +54,21 @@ def test_a_submission_that_breaks_down_costs_itself_alone_and_its_author_reads_w
         assert results[name]["returns"] == [-100, -100]
         assert MISBEHAVE[name][2] in results[name]["failures"][0]
     assert results["student00"]["failures"] == [] and min(results["student00"]["returns"]) > 0
+
+
+def test_a_trained_run_can_be_handed_in_as_it_is_with_its_large_dataset(tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(PRETRAINED / "cropped_input", run)
+    for place in (run / "dataset", run / "more"):
+        place.mkdir()
+        with (place / "episodes.bin").open("wb") as file:
+            file.truncate(LARGEST_SUBMISSION + 1)  # a hole, which takes no disk
+    with pytest.raises(Failure, match="MB, at most 300"):
+        copied(run, tmp_path)
+    shutil.rmtree(run / "more")
+    (out := tmp_path / "out").mkdir()
+    names = {file.name for file in copied(run, out).iterdir()}
+    assert names == {file.name for file in run.iterdir()} - {"dataset"}
 
 
 def test_what_a_child_prints_or_patches_changes_no_score(held):
