@@ -15,8 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-OURS = (str(Path(__file__).parent.parent), sys.prefix, sys.base_prefix)
+import stad_lab
+
+PACKAGES = Path(__file__).parents[1], Path(stad_lab.__file__).parent
+OURS = (*map(str, PACKAGES), sys.prefix, sys.base_prefix)
 BY_HAND = "work this value out by hand, and print what your function computes on the way to it"
+BY_SAMPLE = "print one resample and its result, and how many there are"
 
 
 class Panel:
@@ -95,6 +99,7 @@ def check(
     expected: object,
     mistakes: Mapping[str, object] | None = None,
     tolerance: float = 1e-4,
+    look: str = BY_HAND,
 ) -> None:
     """Print that an answer is right, or raise WrongAnswer with a diagnosis.
 
@@ -102,8 +107,10 @@ def check(
         what: name of the answer, as the student knows it, for example "differences(frames, 4)".
         found: the student's answer: a number, an array or a tensor.
         expected: the right answer, of the same kind (tensor or not; whole, real or bool).
-        mistakes: hint -> what that mistake computes. A hint names the mistake and the remedy.
+        mistakes: hint -> what that mistake computes. A hint says what is wrong, then after a colon
+            the remedy.
         tolerance: largest error, as a share of the largest finite number of `expected`.
+        look: what to look at if no mistake gives the answer.
     """
     check_kind(what, found, expected)
     found, expected = to_numpy(found), to_numpy(expected)
@@ -114,7 +121,7 @@ def check(
                 cause, _, remedy = hint.partition(": ")
                 raise WrongAnswer(what, cause, remedy, difference)
         same = found.shape == expected.shape
-        raise WrongAnswer(what, difference, BY_HAND if same else "print the shape of your result")
+        raise WrongAnswer(what, difference, look if same else "print the shape of your result")
     if found.dtype.kind != expected.dtype.kind:
         wrong = f"right values, but dtype {found.dtype}"
         raise WrongAnswer(what, wrong, f"expected {expected.dtype}")
@@ -126,7 +133,8 @@ def check_interval(
 ) -> None:
     """Check an interval that a student's function computes by resampling."""
     mistakes = {hint: np.array(pair, float) for hint, pair in bounds.items()}
-    check(what, ask(what, answer, *given), np.array(right, float), mistakes, tolerance)
+    found = ask(what, answer, *given)
+    check(what, found, np.array(right, float), mistakes, tolerance, BY_SAMPLE)
 
 
 def check_kind(what: str, found: object, expected: Any) -> None:

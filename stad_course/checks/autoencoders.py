@@ -40,11 +40,11 @@ def kl_values(kl: Callable) -> None:
     mistakes = {
         "the factor 1/2 is missing": 2 * right,
         "the 1 is missing: a latent with mu = 0 and sigma = 1 must cost nothing": right + 16,
-        "exp(0.5 * logvar) is sigma, and the formula wants its square: take exp(logvar)": right
+        "sigma stands where the formula wants its square: take exp(logvar)": right
         + 0.5 * (sigma - variance).sum(1),
         "the sign of the logarithm is turned round: a narrow q has a larger KL": right
         + logvar.sum(1),
-        "logvar is the logarithm of sigma squared, not of sigma: read the formula again": 0.5
+        "logvar was taken for ln sigma: it is the logarithm of sigma squared": 0.5
         * (mu**2 + variance**2 - 1 - 2 * logvar).sum(1),
         "this is how much N(0, 1) diverges from q: exchange the two": 0.5
         * ((mu**2 + 1) / variance - 1 + logvar).sum(1),
@@ -65,9 +65,9 @@ def reparameterise_values(reparameterise: Callable) -> None:
     torch.manual_seed(0)
     own = torch.randn(6, 32)
     mistakes = {
-        "exp(logvar) is the variance, and noise is scaled by sigma: take its root": mu
+        "the noise was scaled by the variance, exp(logvar): take its root": mu
         + logvar.exp() * noise,
-        "logvar is a logarithm: take exp(0.5 * logvar)": mu + logvar * noise,
+        "the noise was scaled by a logarithm: take exp(0.5 * logvar)": mu + logvar * noise,
         "there is no noise in it: multiply sigma by the noise that is given": mu + sigma,
         "this is the mean alone: add sigma times the noise": mu,
         "the mean is missing: add mu": sigma * noise,
@@ -84,25 +84,28 @@ def active_latents(active: Callable) -> None:
     """The latents with more than 0.05 nats, and those with more than 1."""
     nats = np.array(
         [
-            [0.9, 0.4, 0.04, 2.0, 0.0, 0.0],
-            [0.3, 0.4, 0.04, 4.0, 0.06, 0.1],
-            [0.3, 0.4, 0.03, 3.0, 0.0, 0.0],
+            [0.9, 0.4, 0.04, 2.0, 0.0, 0.0, 0.3],
+            [0.3, 0.4, 0.04, 4.0, 0.06, 0.1, 0.02],
+            [0.3, 0.4, 0.03, 3.0, 0.0, 0.0, 0.02],
         ]
     )
     once = "latents 4 and 5 have more than 0.05 in one frame only: take the mean over the frames"
     missing = "the threshold is missing, or this is the sum over the frames: take the mean"
     mistakes = {
-        "the largest KL comes first: reverse the order": [1, 0, 3],
+        "the smallest KL comes first: reverse the order": [6, 1, 0, 3],
+        "the medians over the frames were sorted: take the mean": [3, 1, 0, 6],
+        "these have a median above 0.05: take the mean over the frames": [3, 0, 1],
         "this is the median over the frames: take the mean": [3, 1, 0],
-        "this is the order of the numbers, not of the nats: sort by the nats": [0, 1, 3],
-        once: [3, 0, 1, 5, 4],
-        missing: [3, 0, 1, 2, 5, 4],
+        "this is the order of the numbers, not of the nats: sort by the nats": [0, 1, 3, 6],
+        once: [3, 0, 1, 6, 5, 4],
+        missing: [3, 0, 1, 6, 2, 5, 4],
         "this says which latents are active, as bools: return their numbers": nats.mean(0) > 0.05,
-        "these are nats: return the numbers of the latents": np.array([3.0, 0.5, 0.4]),
+        "these are nats: return the numbers of the latents": nats.mean(0)[[3, 0, 1, 6]],
     }
-    check("active(nats)", ask("active(nats)", active, nats), np.array([3, 0, 1]), mistakes)
+    right = np.array([3, 0, 1, 6])
+    check("active(nats)", ask("active(nats)", active, nats), right, mistakes)
     mistakes = {
-        "the threshold is not used: compare with `threshold`": [3, 0, 1],
+        "the threshold is not used: compare with `threshold`": [3, 0, 1, 6],
         "this says which latents are active, as bools: return their numbers": nats.mean(0) > 1,
         "this is a share of the frames: take the mean over the frames": [3, 0],
     }
@@ -120,7 +123,8 @@ def silenced(silence: Callable) -> None:
         "nothing was silenced: assign 0 to z[:, latents] of the copy": z.clone(),
         "this is the mean of these pictures: the prior's mean is 0": z * keep
         + (1 - keep) * z.mean(0),
-        "1 is not the mean of the prior: set these latents to 0": z * keep + (1 - keep),
+        "these latents are 1, which is not the mean of the prior: set them to 0": z * keep
+        + (1 - keep),
     }
     what = "silence(z, [1, 4])"
     check(what, ask(what, silence, z, np.array([1, 4])), z * keep, mistakes)
@@ -142,7 +146,9 @@ def reactions(reaction: Callable, encode: Callable) -> None:
             "it is upside down: the second between frames belongs below": 1 / right,
             "one norm over all frames: take each frame's (dim=1)": one_norm,
             "this is the mean of ratios: divide the means": (turned / moved).mean(),
-            "begin with frame 50 in both means": 2 * d.mean() / moved.mean(),
+            "the upper mean begins before frame 50: begin with it in both": 2
+            * d.mean()
+            / moved.mean(),
             "stride is not used: give it to earlier_frames": expected[4],
         }
         what = f"reaction(vae, film, {k})"

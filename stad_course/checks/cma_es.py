@@ -34,7 +34,7 @@ def weights_of_ranks(weights: Callable) -> None:
                 right, np.zeros(size - half)
             ),
             "these weigh all points, the worse half negatively: keep the better half": every,
-            "ranks count from 1: i = 1 is the best": right[::-1],
+            "the last counts most: i = 1 is the best": right[::-1],
             "all are equal: the best should count most": np.full(half, 1 / half),
             soft: np.exp(raw) / np.exp(raw).sum(),
             f"{soft}, not those of ranks": np.exp(-ranks) / np.exp(-ranks).sum(),
@@ -45,7 +45,7 @@ def weights_of_ranks(weights: Callable) -> None:
             even = np.log(half + 0.5) - np.log(ranks)
             mistakes["mu + 1/2 is (size + 1) / 2 for an even size only"] = even / even.sum()
             more = right_weights(size + 1)
-            mistakes["round down: mu is size // 2"] = more
+            mistakes["mu was rounded up: it is size // 2"] = more
         check(what, found, right, mistakes, tolerance=1e-3)
 
 
@@ -81,7 +81,7 @@ def ablated(ablate: Callable) -> None:
         what = f"ablate(parameters, {'slice(32, None)' if without_h is None else asked})"
         right = np.where(weights & gone, 0, given)
         mistakes = {
-            "the rows are outputs, the columns inputs: reshape to (3, 288), not (288, 3)": np.where(
+            "rows and columns are exchanged: reshape to (3, 288), not (288, 3)": np.where(
                 weights & transposed, 0, given
             ),
             "the biases went, too: the last three numbers belong to no column": np.where(
@@ -96,7 +96,7 @@ def ablated(ablate: Callable) -> None:
             "these are places of the flat list: reshape the weights to (3, 288) first": np.where(
                 np.isin(position, position[asked]), 0, given
             ),
-            "nothing was changed: reshape may give a copy; assign into a view of your copy": given,
+            "nothing was changed: assign into a view of your copy, whose shape is (3, ...)": given,
         }
         if without_h is not None:
             mistakes["columns is not used: 32 and on were zeroed"] = without_h
@@ -136,6 +136,7 @@ def difference_intervals(difference_interval: Callable) -> None:
         own: (4.0, 34.5),
         place: (0.14, 90.56),
         "this is a 90% interval: take the percentiles 2.5 and 97.5": (11.9, 28.0),
+        "nearly a point: draw with replacement": (skew.mean(), skew.mean()),
         "the sign is turned round: a minus b": (-29.85, -10.75),
         f"{formula}: draw": (9.5, 29.1),
     }

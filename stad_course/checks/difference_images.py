@@ -34,10 +34,14 @@ def check_differences(differences: Callable, film: np.ndarray, stride: int) -> n
         / 255,
         "the sign is turned round: subtract the earlier frame from the later": -right,
         "this is |d|, which has lost its sign: subtract, and take no absolute value": np.abs(right),
-        "scale the frames to [0, 1]: divide by 255": 255 * right,
+        "the frames are not scaled to [0, 1]: divide by 255": 255 * right,
         "you divided by 256: the largest value of a uint8 is 255": right * (255 / 256),
         "film[t - k] with t < k counts from the film's end, as np.roll does: d = 0 there": rolled,
         "the first k frames are missing: keep them, with d = 0": right[stride:],
+        "before frame k film[0] was subtracted, as if it were earlier: d = 0 there": (
+            scaled - scaled[np.maximum(np.arange(len(film)) - stride, 0)]
+        )
+        / 255,
     }
     if stride != 1:
         wrong = episode_differences(film, 1)
@@ -83,12 +87,15 @@ def find_motion_made_up(find_motion: Callable, move: Callable, earlier: np.ndarr
             turns[0],
             forwards[0],
         ),
-        "the rows from 48 on do not move with the road: leave them out": (turns[6], forwards[4]),
-        "subtract in float (in uint8, 3 - 5 is 254), or you kept the largest error": (
+        "the rows from 48 on were compared, too, and do not move: leave them out": (
+            turns[6],
+            forwards[4],
+        ),
+        "in uint8, 3 - 5 is 254, or you kept the largest error: subtract in float": (
             turns[0],
             forwards[8],
         ),
-        "subtract in float, or take squares: 3 - 5 is 254 in uint8; or you kept the largest": (
+        "3 - 5 is 254 in uint8, or you kept the largest error: subtract in float, then square": (
             turns[8],
             forwards[8],
         ),
@@ -137,7 +144,7 @@ def interval(correlation_interval: Callable) -> None:
             0.376,
             0.376,
         ),
-        "a unit that is drawn twice counts twice: np.isin(units, drawn) counts it once": (
+        "a unit that was drawn twice counts once, as with np.isin: take its rows twice": (
             -0.01,
             0.75,
         ),

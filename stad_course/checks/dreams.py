@@ -10,51 +10,59 @@ from stad_course.checks.answers import WrongAnswer, ask, check, check_interval
 
 
 def mixtures() -> tuple[torch.Tensor, ...]:
-    """Mixtures of five Gaussians: logpi, mean, logsigma, log-widths, each (4, 6, 5)."""
+    """Mixtures of five Gaussians: logpi, mean, ln deviation, equal ln deviation: (4, 6, 5)."""
     generator = torch.Generator().manual_seed(2)
     mean = torch.randn(4, 6, 5, generator=generator)
     logpi = torch.randn(4, 6, 5, generator=generator).log_softmax(-1)
     widths = 0.5 * torch.randn(4, 6, 5, generator=generator)
-    return logpi, mean, torch.full((4, 6, 5), -0.5), widths
+    return logpi, mean, widths, torch.full((4, 6, 5), -0.5)
 
 
 def log_density_values(log_density: Callable) -> None:
     """The log density of targets near the mixtures."""
     target = torch.rand(4, 6, generator=torch.Generator().manual_seed(3))
-    check_log_density(log_density, target, "log_density")
+    check_log_density(log_density, mixtures()[:3], target, "log_density")
 
 
 def log_density_far(log_density: Callable) -> None:
-    """The log density a thousand away, where every density is 0 in the computer."""
-    far = torch.full((4, 6), 1e3)
-    what = "log_density, 1000 away"
-    found = ask(what, log_density, *mixtures()[:3], far)
+    """The log density a thousand away, where every density is 0 in the computer.
+
+    There 136 nats are within the tolerance, so the formula is checked near the mixtures before.
+    """
+    logpi, mean, _, equal = mixtures()
+    far, what = torch.full((4, 6), 1e3), "log_density, 1000 away"
+    found = ask(what, log_density, logpi, mean, equal, far)
     if isinstance(found, torch.Tensor) and torch.isinf(found).any():
         hint = "exp(-1360000) is 0 in the computer, and ln 0 is -inf: sum inside torch.logsumexp"
         wrong = f"the answer is {found.flatten()[0].item()}: expected about -1.36e6"
         raise WrongAnswer(what, wrong, hint)
-    check_log_density(log_density, far, what)
+    log_density_values(log_density)
+    check_log_density(log_density, (logpi, mean, equal), far, what)
 
 
-def check_log_density(log_density: Callable, target: torch.Tensor, what: str) -> None:
+def check_log_density(
+    log_density: Callable, mixture: tuple, target: torch.Tensor, what: str
+) -> None:
     """Check a log density of targets (4, 6)."""
-    logpi, mean, logsigma, _ = mixtures()
+    logpi, mean, logsigma = mixture
     each, shift = Normal(mean, logsigma.exp()).log_prob(target[..., None]), 0.5 * np.log(2 * np.pi)
     choice = Categorical(logits=logpi)
     right = MixtureSameFamily(choice, Normal(mean, logsigma.exp())).log_prob(target)
     halved = MixtureSameFamily(choice, Normal(mean, (0.5 * logsigma).exp())).log_prob(target)
     mistakes = {
         "the weights are missing: add logpi before you sum over the Gaussians": each.logsumexp(-1),
-        "the factor 1 / sigma is missing: a narrow Gaussian is higher": right - 0.5,
+        "the factor 1 / sigma is missing: a narrow Gaussian is higher": torch.logsumexp(
+            logpi + each + logsigma, -1
+        ),
         "the factor 1 / sqrt(2 pi) is missing": right + shift,
         "the factor 1/2 before the square is missing": torch.logsumexp(
             logpi + 2 * each + logsigma + shift, -1
         ),
-        "logsigma is ln sigma here, not ln sigma squared: take its exponential": halved,
+        "logsigma was taken for ln sigma squared: it is ln sigma, so take its exponential": halved,
         "these are logarithms of negative numbers: logpi is a logarithm already, so add it": (
             torch.full((4, 6), torch.nan)
         ),
-        "densities add up, their logarithms do not: use logsumexp over the Gaussians": (
+        "logarithms were added: densities add up, so use logsumexp over the Gaussians": (
             logpi + each
         ).sum(-1),
         "this is a weighted mean of logarithms: sum densities, then take the logarithm": (
@@ -62,7 +70,9 @@ def check_log_density(log_density: Callable, target: torch.Tensor, what: str) ->
         ).sum(-1),
         "this is a density: return its logarithm": right.exp(),
         "the sign is turned round: this is the loss, the negative logarithm": -right,
-        "no clamp, and nothing added inside the log": right.clamp(min=-1e5),
+        "it is cut off, by a clamp or a number in the log: use logsumexp alone": right.clamp(
+            min=-1e5
+        ),
     }
     found = ask(what, log_density, logpi, mean, logsigma, target)
     check(what, found, right, mistakes)
@@ -70,7 +80,7 @@ def check_log_density(log_density: Callable, target: torch.Tensor, what: str) ->
 
 def moments_of_mixtures(moments: Callable) -> None:
     """Mean and deviation of mixtures."""
-    logpi, mean, _, widths = mixtures()
+    logpi, mean, widths, _ = mixtures()
     parts, pi = Normal(mean, widths.exp()), logpi.exp()
     both = MixtureSameFamily(Categorical(logits=logpi), parts)
     within, mixed = (pi * parts.variance).sum(-1), (pi * widths.exp()).sum(-1)
@@ -78,25 +88,23 @@ def moments_of_mixtures(moments: Callable) -> None:
     unweighed = ((mean - both.mean[..., None]) ** 2).mean(-1)
     mistakes = {
         "the parts lie apart, and that is missing: add the variance of their means": within.sqrt(),
-        "variances may be averaged, deviations may not; and the spread of the means is missing": (
-            mixed
-        ),
+        "deviations were averaged, and the spread of the means is missing: add variances": (mixed),
         "the parts are wide, and that is missing: add their mean variance": between.sqrt(),
-        "weigh the squares by pi = exp(logpi)": (within + unweighed).sqrt(),
-        "exp(logsigma) is a deviation, its square exp(2 * logsigma) a variance": (
+        "the squares are not weighed: use pi = exp(logpi)": (within + unweighed).sqrt(),
+        "a deviation was taken for a variance: that is its square, exp(2 * logsigma)": (
             mixed + between
         ).sqrt(),
         "this is the variance: take its square root": both.variance,
-        "add variances, then take the root: deviations do not add up": within.sqrt()
-        + between.sqrt(),
+        "deviations were added: add variances, then take the root": within.sqrt() + between.sqrt(),
     }
     found = ask("moments", moments, logpi, mean, widths)
     some = isinstance(found, tuple | list) or (isinstance(found, torch.Tensor) and found.ndim > 0)
     if not some or len(found) != 2:
         wrong = "moments must return two tensors"
         raise WrongAnswer("moments", wrong, "return mean, deviation")
-    weigh = "weigh each mean by pi = exp(logpi)"
-    centers = {weigh: mean.mean(-1), f"logpi is negative: {weigh}": (logpi * mean).sum(-1)}
+    weigh = "use pi = exp(logpi)"
+    centers = {f"the means are not weighed: {weigh}": mean.mean(-1)}
+    centers[f"logpi, which is negative, was taken as the weight: {weigh}"] = (logpi * mean).sum(-1)
     check("the mean", found[0], both.mean, centers)
     check("the deviation", found[1], both.stddev, mistakes)
 
@@ -111,21 +119,21 @@ def horizons(horizon: Callable) -> None:
         "at this step most episodes err more, or it is the last one: compare sums, find the first"
     )
     mistakes = {
-        "steps count from 1: the first column is one step": 3,
+        "this is the place of a column: steps count from 1, so add 1": 3,
         "only a single episode errs more there: take the sums over the episodes": 2,
         most: 5,
     }
     check("horizon", ask("horizon", horizon, dream, constant), 4, mistakes)
     twice, what = dream[:, [0, 3, 1, 4]], "horizon, if they meet twice"
     mistakes = {
-        "the dreams come back, and err more again: find the first place": 4,
-        "steps count from 1: the first column is one step": 1,
+        "this is the second time that they err more: find the first place": 4,
+        "this is the place of a column: steps count from 1, so add 1": 1,
     }
     check(what, ask(what, horizon, twice, constant[:, :4]), 2, mistakes)
     what = "horizon, if dreams never err more"
     mistakes = {
         "argmax of no True at all is 0: ask first whether there is one": 1,
-        "steps count from 1: the last is the number of steps": 4,
+        "this is the place of the last column: steps count from 1, so add 1": 4,
     }
     check(what, ask(what, horizon, dream, 9 + constant), 5, mistakes)
 
