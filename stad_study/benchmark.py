@@ -209,7 +209,7 @@ def step_cars(cars: Cars, draw: bool, actions: np.ndarray) -> None:
 
 def measure_loop(rounds: int) -> dict:
     """A generation of 8 agents, batches of several sizes, and the parts of a frame."""
-    config, agent = Config.preset("paper"), load_agent(SOURCE)
+    config, agent = Config.preset("paper", evolution={"tracks": 1}), load_agent(SOURCE)
     world_model, parameters = agent.world_model, agent.parameters
     shape = config.evolution.population, parameters.size
     population = parameters + 0.01 * np.random.default_rng(0).standard_normal(shape)

@@ -143,7 +143,7 @@ stad.start(async () => {
     const end = track.laps[chosen]
       ? `a whole lap in ${seconds} seconds`
       : frames < 1000
-        ? `it left the field after ${seconds} seconds`
+        ? `it left the map after ${seconds} seconds`
         : "no whole lap in 20 seconds";
     const driven = generation * run.episodes;
     const text = `Generation ${generation}: ${points.toFixed(0)} points, ${end}.`;

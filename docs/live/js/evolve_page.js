@@ -201,7 +201,7 @@ stad.start(async () => {
   });
   for (const name of stad.evolveSettings.NAMES)
     get(name).addEventListener("change", () => {
-      get("warning").textContent = "It will hold after a fresh start.";
+      get("warning").textContent = "It applies after a fresh start.";
     });
   get("restart").addEventListener("blur", () => {
     get("warning").textContent = "";

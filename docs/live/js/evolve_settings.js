@@ -33,7 +33,7 @@ stad.evolveSettings = {
       (name) => asked.has(name) && asked.get(name) !== `${found[name]}`,
     );
     const told = vain.map((name) => `${name}=${asked.get(name)}`);
-    return told.length ? `The address asks for what does not exist: ${told.join(", ")}.` : "";
+    return told.length ? `Ignored in the address: ${told.join(", ")}.` : "";
   },
 
   /** What is wrong with the seed, the one setting that is typed; null if nothing is. */

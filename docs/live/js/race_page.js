@@ -248,7 +248,7 @@ stad.start(async () => {
     context.font = "600 17px system-ui, sans-serif";
     context.textAlign = "center";
     const told = autopilot()
-      ? "It has never learned to find back."
+      ? "It never learned to come back."
       : "The arrow leads back to the road.";
     context.fillText(told, width / 2, 0.2 * height);
   }
@@ -358,10 +358,10 @@ stad.start(async () => {
     const [mine, its] = [you.score, rival.score];
     const won = mine > its ? "You beat the agent!" : mine === its ? "A draw" : "The agent wins";
     const title = helped ? "The autopilot has driven" : won;
-    const ways = ["The time is up", "A whole lap", "You left the field"];
+    const ways = ["The time is up", "A whole lap", "You left the map"];
     const text =
       `${ways[you.ending]} after ${seconds(you.frames)} s: ${mine.toFixed(1)} points. ` +
-      `The agent's lap gives ${its.toFixed(1)}. ${recordOf(mine, helped)} ` +
+      `Your rival has ${its.toFixed(1)}. ${recordOf(mine, helped)} ` +
       `${touching ? "Touch the picture" : "Press an arrow key"} to race again.`;
     showCard(title, text);
     stad.announce(`${title} ${text}`);
