@@ -1,7 +1,7 @@
 """The statistics of study 5 that docs/protocol.md fixes, computed from its tables.
 
-The score of a seed is the mean of its three runs. Before the last run of a part is in the tables,
-only the progress is reported: nothing is tested earlier.
+The score of a seed is the mean of its three runs. Before the last run of a family of parts is in
+the tables, only the progress is reported: nothing is tested or shown earlier.
 """
 
 from pathlib import Path
@@ -17,6 +17,7 @@ from stad_study.study import STUDIES
 from stad_study.study5 import ARMS, REPEATS, STUDY5
 from stad_study.study_claims import compare, find_verdict, mean_curve
 
+RELEVANT = "relevant difference"  # some arms lead, others trail
 Families = dict[tuple[str, ...], dict[str, tuple[dict[str, float], ...]]]
 
 FAMILIES: Families = {  # the parts that must be complete -> comparison -> arms added and subtracted
@@ -36,7 +37,7 @@ FAMILIES: Families = {  # the parts that must be complete -> comparison -> arms 
     },
 }
 DESCRIBED: Families = {  # without a test
-    ("5c",): {
+    ("5b", "5c"): {
         "both with motion": ({"input_output: z + motion": 1}, {"frame: z + motion": 1}),
         "remembering the action": ({"frame: z + action": 1}, {"frame: z + placebo": 1}),
     },
@@ -44,19 +45,22 @@ DESCRIBED: Families = {  # without a test
 
 
 def describe_study5(folder: Path = tables.DATA) -> dict:
-    """Progress by part; and for complete parts "arms" and "comparisons".
+    """Progress by part; and for complete families of parts "arms" and "comparisons".
 
     An arm is named by variant and what C sees: "frame: z + motion".
     """
     counts = describe_counts(STUDY5, folder)
     planned = counts["planned"].items()
-    complete = [part for part, runs in planned if counts["runs"][part] == runs]
-    scores, curves = scores_of(complete, folder), curves_of(complete, folder)
+    complete = {part for part, runs in planned if counts["runs"][part] == runs}
+    shown = [part for family in FAMILIES if set(family) <= complete for part in family]
+    scores, curves = scores_of(shown, folder), curves_of(shown, folder)
     arms = {arm: describe_arm(scores[arm], curves[arm]) for arm in scores}
+    for arm, used in processors_of(shown, folder).items():
+        arms[arm]["processors"] = used
     found: dict[str, Any] = {**counts, "arms": arms, "comparisons": {}}
     for families, tested in ((FAMILIES, True), (DESCRIBED, False)):
         for parts, comparisons in families.items():
-            if set(parts) <= set(complete):
+            if set(parts) <= complete:
                 found["comparisons"] |= compare_family(scores, comparisons, tested)
     return found
 
@@ -64,7 +68,22 @@ def describe_study5(folder: Path = tables.DATA) -> dict:
 def scores_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndarray]:
     """Arm -> returns (seeds, tracks), averaged over the runs of each seed."""
     table = tables.read_or_empty("study5_returns", folder).set_index(tables.SENSED)
-    return by_arm(table[[column for column in table if column.isdigit()]], parts)
+    table = table[[column for column in table if column.isdigit()]]
+    tracks = STUDIES["study1"].tracks
+    if parts and (list(map(int, table)) != list(tracks) or table.isna().any(axis=None)):
+        where = f"the tracks {tracks[0]} to {tracks[-1]}"
+        raise ValueError(f"study5_returns: expected a return of each run on {where}")
+    return by_arm(table, parts)
+
+
+def processors_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, dict[str, int]]:
+    """Arm -> processor -> how many of its runs were driven on it."""
+    table = tables.read_or_empty("study5_runs", folder)
+    if not parts:
+        return {}
+    counts = table.groupby(["variant", "sees"])["processor"].value_counts()
+    arms = [arm for part in parts for arm in ARMS[part]]
+    return {f"{variant}: {sees}": counts[variant, sees].to_dict() for variant, sees in arms}
 
 
 def curves_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndarray]:
@@ -102,5 +121,6 @@ def compare_family(scores: dict[str, np.ndarray], comparisons: dict, tested: boo
     if tested:
         adjusted = statistics.holm([one["p"] for one in found.values()])
         for one, p in zip(found.values(), adjusted, strict=True):
-            one |= {"holm_p": p, "verdict": find_verdict(one["interval"], p)}
+            verdict = find_verdict(one["interval"], p).replace("relevant gain", RELEVANT)
+            one |= {"holm_p": p, "verdict": verdict}
     return found

@@ -17,7 +17,7 @@ def write_tables(folder, runs):
     rng, lines = np.random.default_rng(0), []
     for run in runs:
         mean = 800 + EFFECTS.get(run.sees, 0) + 20 * (run.variant == "input_output")
-        returns = mean + rng.normal(0, 5) + rng.normal(0, 20, 40)
+        returns = mean + rng.normal(0, 5) + rng.normal(0, 20, 400)
         columns = {str(1000 + track): one for track, one in enumerate(returns)}
         curve = {"validation.5": mean - 100 - run.repeat, "validation.10": mean}
         lines.append((run._asdict(), columns | curve | {"mean": returns.mean()}))
@@ -33,7 +33,24 @@ def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
     found = describe_study5(tmp_path)
     assert found["runs"] == {"5a": 216, "5b": 72, "5c": 143}
     assert set(found["comparisons"]) == {"interaction", "input_output less input"}
-    assert "frame: z + motion" not in found["arms"] and "frame: z" in found["arms"]
+    assert "frame: z" in found["arms"]
+    for hidden in ("frame: z + motion", "input_output: z - motion"):  # of a family that goes on
+        assert hidden not in found["arms"]
+
+
+@pytest.mark.parametrize("spoil", ["a return is missing", "a track is missing"])
+def test_a_table_with_a_gap_is_refused(tmp_path, spoil):
+    write_tables(tmp_path, find_runs(STUDY5))
+    table = tables.read("study5_returns", tmp_path)
+    if spoil == "a return is missing":
+        table.loc[5, "1007"] = np.nan
+    else:
+        del table["1007"]
+    tables.save("study5_returns", table, tmp_path)
+    with pytest.raises(
+        ValueError, match="expected a return of each run on the tracks 1000 to 1399"
+    ):
+        describe_study5(tmp_path)
 
 
 def test_the_learning_curve_of_an_arm_is_averaged_over_its_runs(tmp_path):
@@ -41,6 +58,7 @@ def test_the_learning_curve_of_an_arm_is_averaged_over_its_runs(tmp_path):
     arms = describe_study5(tmp_path)["arms"]
     assert arms["frame: z + motion"]["curve"]["mean"] == [738, 840]
     assert arms["input_output: z"]["curve"]["low"] == [718, 820]
+    assert arms["input_output: z"]["processors"] == {"a CPU": 36}
 
 
 def test_effects_are_found_and_corrected_within_their_family(tmp_path):
@@ -56,4 +74,5 @@ def test_effects_are_found_and_corrected_within_their_family(tmp_path):
     pair = [found[name] for name in ("interaction", "input_output less input")]
     low, high = sorted(pair, key=lambda one: one["p"])
     assert low["holm_p"] == pytest.approx(2 * low["p"]) and high["holm_p"] >= high["p"]
+    assert found["interaction"]["verdict"] == "no relevant difference"
     assert {"verdict", "p"}.isdisjoint(found["both with motion"])
