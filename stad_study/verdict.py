@@ -4,7 +4,7 @@ Every sentence follows from the comparisons of `stad_study.study_claims`.
 """
 
 from stad_study.claims import PAPER
-from stad_study.study_claims import LEVEL
+from stad_study.study_claims import LEVEL, MARGIN
 
 PAPER_GAIN = PAPER["input_output"] - PAPER["frame"]
 SEES = {"z, h": "z and h, as we read the paper", "z": "z alone"}  # the claim, and a diagnostic
@@ -28,6 +28,8 @@ def describe_comparison(features: str, one: dict) -> str:
     leads = f"{'trails' if points < 0 else 'leads'} `frame` by {abs(points):.1f} points"
     text = f"If C sees {SEES[features]}, the verdict is *{one['verdict']}*: `input_output` {leads}"
     text += f" (95% interval {low:.1f} to {high:.1f})"
+    if one["verdict"] == "gain" and low < MARGIN:
+        text += ", perhaps too few to matter"
     if one["verdict"] == "undecided":
         text += f"; {one['seeds_that_decide']} seeds would decide"
     return text + "."
@@ -41,12 +43,15 @@ def describe_interaction(one: dict) -> str:
 
 
 def describe_paper_gain(comparisons: dict[str, dict]) -> str:
-    """How many intervals lie below the gain that the paper has for their variant."""
+    """How many intervals and single pairs lie below the paper's gain of their variant."""
     gains = {variant: score - PAPER["frame"] for variant, score in PAPER.items()}
-    below = [
-        one["interval"][1] < gains[name.partition(": ")[2]] for name, one in comparisons.items()
-    ]
+    below, reached = [], []
+    for name, one in comparisons.items():
+        gain = gains[name.partition(": ")[2]]
+        below.append(one["interval"][1] < gain)
+        reached += [points >= gain for points in one["by_seed"]]
     count = f"all {len(below)}" if all(below) else f"{sum(below)} of the {len(below)}"
     low, *_, high = sorted(gains.values())[1:]  # without that of frame, 0
-    text = f"The paper reports gains of {low:.0f} to {high:.0f} points, above {count} intervals;"
-    return f"{text} it used CarRacing-v0 and another recipe."
+    text = f"The paper reports gains of {low:.0f} to {high:.0f} points, above {count} intervals of"
+    text += f" means; {sum(reached)} of {len(reached)} single pairs reach them."
+    return f"{text} It used CarRacing-v0 and another recipe."
