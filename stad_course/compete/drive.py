@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stad_course.compete.limits import Limits
-from stad_course.compete.process import Failure, Submission
+from stad_course.compete.process import Failure, Submission, files_of
 from stad_lab.agent import PRETRAINED, rollout
 from stad_lab.envs.cars import Cars
 from stad_lab.io.files import checksum, checksum_of_json, load_json, save_json
@@ -187,9 +187,7 @@ def fingerprint(path: Path) -> str:
     """A checksum of a submission's files."""
     if path.is_file():
         return checksum(path.read_bytes())
-    files = sorted(
-        file for file in path.rglob("*") if file.is_file() and "__pycache__" not in file.parts
-    )
+    files = sorted(file for file in files_of(path) if "__pycache__" not in file.parts)
     return checksum_of_json(
         [[str(one.relative_to(path)), checksum(one.read_bytes())] for one in files]
     )

@@ -251,11 +251,7 @@ class Submission:
 def copied(path: Path, folder: Path) -> Path:
     """A copy of a submission in a folder, without a run's dataset. Failure if it is too large."""
     target = folder / path.resolve().name
-    is_run = path.is_dir() and not (path / AGENT_FILE).exists()
-    files = [path] if path.is_file() else [one for one in path.rglob("*") if one.is_file()]
-    if is_run:
-        files = [one for one in files if not one.is_relative_to(path / DATASET)]
-    size = sum(one.lstat().st_size for one in files)
+    size = sum(one.lstat().st_size for one in files_of(path))
     if size > LARGEST_SUBMISSION:
         raise Failure(
             f"it has {size / 1e6:.0f} MB, at most {LARGEST_SUBMISSION / 1e6:.0f} are read"
@@ -264,6 +260,20 @@ def copied(path: Path, folder: Path) -> Path:
         return Path(shutil.copyfile(path, target))
 
     def left_out(parent: str, _: list[str]) -> list[str]:
-        return [DATASET] if is_run and Path(parent) == path else []
+        return [DATASET] if is_run(path) and Path(parent) == path else []
 
     return Path(shutil.copytree(path, target, symlinks=True, ignore=left_out))
+
+
+def is_run(path: Path) -> bool:
+    """Whether a submission is the folder of a trained run."""
+    return path.is_dir() and not (path / AGENT_FILE).exists()
+
+
+def files_of(path: Path) -> list[Path]:
+    """The files of a submission, without a run's dataset, which has gigabytes."""
+    if path.is_file():
+        return [path]
+    files = [one for one in path.rglob("*") if one.is_file()]
+    left_out = path / DATASET
+    return [one for one in files if not (is_run(path) and one.is_relative_to(left_out))]

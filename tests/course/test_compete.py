@@ -18,6 +18,7 @@ from stad_course.compete.drive import (
     STARTER,
     check_submission,
     drive_batch,
+    fingerprint,
 )
 from stad_course.compete.limits import Limits
 from stad_course.compete.process import LARGEST_SUBMISSION, Failure, Submission, can_isolate, copied
@@ -67,8 +68,11 @@ def test_a_trained_run_can_be_handed_in_as_it_is_with_its_large_dataset(tmp_path
         copied(run, tmp_path)
     shutil.rmtree(run / "more")
     (out := tmp_path / "out").mkdir()
+    before = fingerprint(run)
     names = {file.name for file in copied(run, out).iterdir()}
     assert names == {file.name for file in run.iterdir()} - {"dataset"}
+    shutil.rmtree(run / "dataset")
+    assert fingerprint(run) == before  # and it is not read
 
 
 def test_what_a_child_prints_or_patches_changes_no_score(held):
