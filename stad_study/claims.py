@@ -26,6 +26,7 @@ from stad_study.experiments import BASELINE_DRIVERS, EXPERIMENTS
 
 CLAIMS = tables.DATA / "claims.json"
 PAPER = {"frame": 827.0, "input": 905.0, "output": 906.0, "input_output": 902.0}  # on CarRacing-v0
+PAPER_GAINS = {variant: PAPER[variant] - PAPER["frame"] for variant in list(PAPER)[1:]}
 
 
 def compute_claims() -> dict[str, dict]:

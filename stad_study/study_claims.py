@@ -133,6 +133,16 @@ def compare_afterwards(returns: dict[str, np.ndarray]) -> dict[str, dict]:
     return found | {"input_output less input": compare(*both)}
 
 
+def primary_gains(returns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Features -> the score of `input_output` less that of `frame`, by seed: (seeds,)."""
+    return {
+        features: (returns[f"{features}: input_output"] - returns[f"{features}: frame"]).mean(
+            axis=1
+        )
+        for features in FEATURES
+    }
+
+
 def leave_one_out(returns: dict[str, np.ndarray]) -> dict[str, list[str]]:
     """Features -> the primary verdicts that all seeds but one would give, for each seed left out.
 
@@ -140,10 +150,9 @@ def leave_one_out(returns: dict[str, np.ndarray]) -> dict[str, list[str]]:
     are Student's, because the bootstrap's end close to the margin changes with the resamples.
     """
     found: dict[str, list[str]] = {features: [] for features in FEATURES}
-    gains = [returns[f"{f}: input_output"] - returns[f"{f}: frame"] for f in FEATURES]
-    by_seed = [gain.mean(axis=1) for gain in gains]
-    for seed in range(len(by_seed[0])):
-        others = [np.delete(own, seed) for own in by_seed]
+    by_seed = primary_gains(returns)
+    for seed in range(len(by_seed["z"])):
+        others = [np.delete(own, seed) for own in by_seed.values()]
         adjusted = statistics.holm([statistics.paired_p(own) for own in others])
         for features, own, p in zip(FEATURES, others, adjusted, strict=True):
             found[features].append(find_verdict(statistics.mean_interval(own), p))
@@ -157,17 +166,10 @@ def describe_equivalence(returns: dict[str, np.ndarray]) -> dict[str, dict]:
     90%. "stays" counts the seeds without which they still reject.
     """
     found = {}
-    for features in FEATURES:
-        by_seed = (returns[f"{features}: input_output"] - returns[f"{features}: frame"]).mean(
-            axis=1
-        )
+    for features, by_seed in primary_gains(returns).items():
         without = [np.delete(by_seed, seed) for seed in range(len(by_seed))]
         stays = sum(statistics.equivalence_p(own, MARGIN) < LEVEL for own in without)
-        found[features] = {
-            "interval_90": statistics.mean_interval(by_seed, 0.1),
-            "p": statistics.equivalence_p(by_seed, MARGIN),
-            "stays": stays,
-        }
+        found[features] = {"p": statistics.equivalence_p(by_seed, MARGIN), "stays": stays}
     return found
 
 
