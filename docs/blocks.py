@@ -19,11 +19,13 @@ from stad_lab.evaluation.trajectories import MOTION
 from stad_study import cli as study_cli
 from stad_study.claims import PAPER
 from stad_study.figures import (
+    CAUSE,
     DRIVERS,
     SEEN,
     SOURCES,
     TURNING,
     difference_of,
+    plot_cause,
     plot_drivers,
     plot_learning_curves,
     plot_primary,
@@ -31,7 +33,12 @@ from stad_study.figures import (
     plot_study,
 )
 from stad_study.study_claims import FAMILIES, FEATURES, MARGIN
-from stad_study.verdict import PAPER_GAIN, describe_interaction, describe_verdict
+from stad_study.verdict import (
+    PAPER_GAIN,
+    describe_cause,
+    describe_interaction,
+    describe_verdict,
+)
 
 ROOT = Path(__file__).parent.parent
 AGENTS = (*config.VARIANTS, "cropped_input")
@@ -105,15 +112,40 @@ def study1(claims: dict) -> str:
 
 def afterwards(claims: dict) -> str:
     """The comparisons that were computed after study 1."""
-    names = {"interaction": "`input_output` - `frame`: with z, less the same with z and h"}
+    names = {"interaction": CAUSE["interaction"]}
     for features, seen in SEEN.items():
         names[f"{features}: input_output less input"] = f"`input_output` - `input`, {seen}"
-    names["input_output less input"] = "`input_output` - `input`, mean of both C"
+    names["input_output less input"] = CAUSE["input_output less input"]
     lines = []
     for name, title in names.items():
         one = claims["study1"]["afterwards"][name]
         lines.append((title, difference_of(one), p_value(one["p"])))
     return table(("comparison", "difference (95% interval)", "p"), lines)
+
+
+def cause(claims: dict) -> str:
+    """Study 5: how many runs are done, and of complete parts the verdicts, figure and tests."""
+    study = claims["study5"]
+    counts = (f"{part} {runs} of {study['planned'][part]}" for part, runs in study["runs"].items())
+    parts = [f"Runs done: {', '.join(counts)}."]
+    if study["comparisons"]:
+        verdicts = "\n".join(f"- {sentence}" for sentence in describe_cause(study))
+        parts = [verdicts, image("study5", claims), cause_table(study), *parts]
+    return "\n\n".join(parts)
+
+
+def cause_table(study: dict) -> str:
+    """The comparisons of study 5; those without a p-value are described only."""
+    lines = []
+    for name, title in CAUSE.items():
+        if name in study["comparisons"]:
+            one = study["comparisons"][name]
+            low, high = one["t_interval"]
+            cells = (title, difference_of(one), f"{low:.1f} to {high:.1f}")
+            tests = [p_value(one[key]) for key in ("p", "holm_p") if key in one] or ["", ""]
+            lines.append((*cells, *tests, one.get("verdict", "described")))
+    head = ("comparison", "difference (95% interval)", "t-interval", "p", "Holm's p", "verdict")
+    return table(head, lines)
 
 
 def outcomes(claims: dict) -> str:
@@ -204,7 +236,13 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
     "study1_curves": lambda claims: plot_learning_curves(claims["study1"]["curve_differences"]),
     "study1_primary": lambda claims: plot_primary(claims["study1"]["comparisons"], MARGIN),
     "study3": lambda claims: plot_drivers(claims["study3"]),
+    "study5": lambda claims: plot_cause(claims["study5"]["comparisons"], MARGIN),
 }
+
+
+def drawable(claims: dict) -> set[str]:
+    """The names of FIGURES whose data there are: study 5 has one when a part is complete."""
+    return set(FIGURES) - (set() if claims["study5"]["comparisons"] else {"study5"})
 
 
 def image(name: str, claims: dict) -> str:
@@ -473,6 +511,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "study1": study1,
     "afterwards": afterwards,
     "outcomes": outcomes,
+    "cause": cause,
     "faster recipe": faster_recipe,
     "turning": turning_table,
     "study3, agent": lambda claims: study3(claims, "agent"),
@@ -518,6 +557,4 @@ NUMBERS: dict[str, Callable[[dict], float]] = {
     "probed networks": lambda claims: claims["study3"]["networks"],
     "verdicts that stay": lambda claims: stays(claims["study1"], "z, h"),
     "diagnostic verdicts that stay": lambda claims: stays(claims["study1"], "z"),
-    "runs of study 5": lambda claims: sum(claims["study5"]["runs"].values()),
-    "planned runs of study 5": lambda claims: sum(claims["study5"]["planned"].values()),
 }

@@ -21,6 +21,14 @@ COLOURS = dict(zip(VARIANTS, COLORS, strict=False))  # those of the rows of `plo
 SEEN = {"z, h": "C sees z and h", "z": "C sees z"}
 DRIVERS = {"agent": "an agent", "random_driver": "the random driver"}
 SOURCES = {"z": "z", "z, h": "z and h"}
+CAUSE = {  # the comparisons of study 5, in Markdown
+    "interaction": "`input_output` - `frame`: with z, less the same with z and h",
+    "input_output less input": "`input_output` - `input`, mean of both C",
+    "adding motion": "`frame`: z + motion, less z + placebo",
+    "erasing motion": "`input_output`: z - motion, less z - placebo",
+    "both with motion": "`input_output` - `frame`, both with z + motion",
+    "remembering the action": "`frame`: z + action, less z + placebo",
+}
 TURNING = ("slip speed", "yaw rate", "wheel angle")  # what a single frame does not show
 
 
@@ -51,8 +59,7 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
         name_rows(axis, variants)
         axis.set_title(title, loc="left", fontsize=10)
     axes[1, 0].set_xlabel("mean return less that of frame with the same seed, points")
-    handles = {name: one for one, name in zip(*axes[0, 0].get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=9)
+    name_marks(figure, axes[0, 0])
     told = []
     for features, seen in SEEN.items():
         named = ((variant, comparisons[f"{features}: {variant}"]) for variant in variants)
@@ -76,6 +83,33 @@ def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:
     axis.plot(one["difference"], height, "D", color=colour, markersize=7)
     places = [height - 0.27] * len(one["by_seed"])
     axis.plot(one["by_seed"], places, "o", markersize=5, label="one seed", **seeds)
+
+
+def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
+    """The comparisons of study 5 that there are, a row each.
+
+    Args:
+        comparisons: name, of `CAUSE` -> "difference", "interval" and "by_seed".
+        margin: as of `plot_study`.
+    """
+    titles = {name: title.replace("`", "") for name, title in CAUSE.items()}
+    rows = {title: comparisons[name] for name, title in titles.items() if name in comparisons}
+    figure, ((axis,),) = new_figure(8.6, 1.4 + 0.55 * len(rows))
+    axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
+    axis.axvline(0, color="black", linewidth=0.8)
+    for height, one in enumerate(rows.values()):
+        plot_comparison(axis, height, one, COLOURS["input_output"])
+    name_rows(axis, [title.replace(", less", ",\nless") for title in rows])
+    axis.set_xlabel("difference, points")
+    name_marks(figure, axis)
+    told = [f"{title} {difference_of(one)}" for title, one in rows.items()]
+    return describe(figure, "Study 5: what explains the gain", "Means: ", ["; ".join(told)])
+
+
+def name_marks(figure: Figure, axis: Axes) -> None:
+    """A legend below the figure, a line for each kind of mark of an axis."""
+    handles = {name: one for one, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=9)
 
 
 def plot_scores(arms: dict[str, dict]) -> Figure:
@@ -178,8 +212,7 @@ def plot_primary(comparisons: dict[str, dict], margin: float) -> Figure:
         plot_comparison(axis, height, one, COLOURS["input_output"])
     name_rows(axis, primary)
     axis.set_xlabel("points more or less than without difference images")
-    handles = {name: one for one, name in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=3, fontsize=9)
+    name_marks(figure, axis)
     told = [f"{seen} {difference_of(one)}, {one['verdict']}" for seen, one in primary.items()]
     lead = f"Means of {len(one['by_seed'])} seeds with 95% intervals: "
     return describe(figure, "What difference images change", lead, ["; ".join(told)])

@@ -1,12 +1,21 @@
-"""The verdict of study 1 in words, for the pages.
+"""The verdicts of studies 1 and 5 in words, for the pages.
 
-Every sentence follows from the comparisons of `stad_study.study_claims`.
+Every sentence follows from the comparisons of `study_claims` and `study5_claims`.
 """
 
 from stad_study.claims import PAPER_GAINS
 from stad_study.study_claims import LEVEL, MARGIN
 
 PAPER_GAIN = PAPER_GAINS["input_output"]
+CAUSE = {  # test of study 5 -> what is compared, and what differs
+    "interaction": ("z instead of z and h", "the effect of `input_output`"),
+    "input_output less input": ("`input_output` instead of `input`", "the score of both C"),
+    "adding motion": ("the true motion instead of another episode's", "the score of `frame`"),
+    "erasing motion": (
+        "the motion erased instead of random directions",
+        "the score of `input_output`",
+    ),
+}
 SEES = {"z, h": "z and h, as we read the paper", "z": "z alone"}  # the claim, and a diagnostic
 
 
@@ -54,3 +63,37 @@ def describe_paper_gain(comparisons: dict[str, dict]) -> str:
     text = f"The paper reports gains of {low:.0f} to {high:.0f} points, above {count} intervals of"
     text += f" means; {sum(reached)} of {len(reached)} single pairs reach them."
     return f"{text} It used CarRacing-v0 and another recipe."
+
+
+def describe_cause(study: dict) -> list[str]:
+    """A sentence for each tested comparison of study 5, and after the last one the reading.
+
+    Args:
+        study: what `describe_study5` returns.
+    """
+    comparisons = study["comparisons"]
+    told = []
+    for name, (change, what) in CAUSE.items():
+        if name in comparisons:
+            one = comparisons[name]
+            points = f"{one['difference']:+.1f} points"
+            told.append(f"With {change}, {what} changes by {points}: *{one['verdict']}*.")
+    if set(CAUSE) <= set(comparisons):
+        told.append(read_cause(comparisons))
+    return told
+
+
+def read_cause(comparisons: dict[str, dict]) -> str:
+    """Whether the motion explains the gain, by the rule that the protocol fixed for study 5."""
+    low, high = comparisons["both with motion"]["interval"]
+    holds = {
+        "the effect is larger with z": comparisons["interaction"]["verdict"] == "gain",
+        "adding the motion is a gain": comparisons["adding motion"]["verdict"] == "gain",
+        "erasing it is a harm": comparisons["erasing motion"]["verdict"] == "harm",
+        "with the motion both variants earn the same": low > -MARGIN and high < MARGIN,
+    }
+    if all(holds.values()):
+        return "All that the protocol asks for holds: the motion explains the gain."
+    missing = "; ".join(name for name, found in holds.items() if not found)
+    shown = "; ".join(name for name, found in holds.items() if found) or "nothing"
+    return f"That the motion explains the gain is not shown. Shown: {shown}. Not shown: {missing}."

@@ -1,5 +1,8 @@
 """The statistics of study 5: nothing is tested before a part is complete, and effects are found."""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pandas
 import pytest
@@ -8,6 +11,9 @@ from stad_study import tables
 from stad_study.evolved import find_runs
 from stad_study.study5 import STUDY5
 from stad_study.study5_claims import describe_study5
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+import blocks
 
 EFFECTS = {"z + motion": 40, "z - motion": -40}  # points
 
@@ -76,3 +82,20 @@ def test_effects_are_found_and_corrected_within_their_family(tmp_path):
     assert low["holm_p"] == pytest.approx(2 * low["p"]) and high["holm_p"] >= high["p"]
     assert found["interaction"]["verdict"] == "no relevant difference"
     assert {"verdict", "p"}.isdisjoint(found["both with motion"])
+
+
+@pytest.mark.parametrize(("missing", "rows"), [(0, 6), (1, 2), (289, 0)])
+def test_the_page_shows_the_tests_of_complete_parts_alone(tmp_path, missing, rows):
+    runs = find_runs(STUDY5)
+    write_tables(tmp_path, runs[: len(runs) - missing])
+    claims = {"study5": describe_study5(tmp_path)}
+    page = blocks.cause(claims)
+    lines = [line for line in page.splitlines() if line.startswith("| `")]
+    assert len(lines) == rows and ("../notebooks/pictures/study5.png" in page) == (rows > 0)
+    assert f"5c {max(0, 144 - missing)} of 144" in page
+    assert ("study5" in blocks.drawable(claims)) == (rows > 0)
+    if rows:
+        axis = blocks.FIGURES["study5"](claims).axes[0]
+        drawn = [list(line.get_xdata()) for line in axis.lines]
+        for one in claims["study5"]["comparisons"].values():
+            assert one["by_seed"] in drawn and one["interval"] in drawn
