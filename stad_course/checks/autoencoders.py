@@ -16,18 +16,25 @@ def codes() -> torch.Tensor:
 
 
 def check_gradients(
-    what: str, answer: Callable, given: tuple, right: torch.Tensor, mistakes: dict
+    what: str, answer: Callable, given: tuple, formula: Callable, mistakes: dict
 ) -> None:
     """Check a function of mu, logvar and more: its values, and the gradients of mu and logvar."""
     mu, logvar, *others = given
     leaves = {"mu": mu.clone().requires_grad_(), "logvar": logvar.clone().requires_grad_()}
+    ours = [leaf.detach().clone().requires_grad_() for leaf in leaves.values()]
+    right = formula(*ours, *others)
+    right.sum().backward()
     found = ask(what, answer, *leaves.values(), *others)
-    check(what, found, right, mistakes)
+    check(what, found, right.detach(), mistakes)
     if found.requires_grad:
         found.sum().backward()
     if lost := [name for name, leaf in leaves.items() if leaf.grad is None]:
         remedy = "then nothing is learned through it: do not detach, and avoid NumPy and no_grad()"
         raise WrongAnswer(what, f"no gradient comes back to {' and '.join(lost)}", remedy)
+    for (name, leaf), own in zip(leaves.items(), ours, strict=True):
+        if not torch.allclose(leaf.grad, own.grad, atol=1e-4):
+            remedy = "then V learns something else: do not detach a part of the formula"
+            raise WrongAnswer(what, f"a wrong gradient comes back to {name}", remedy)
 
 
 def kl_values(kl: Callable) -> None:
@@ -35,7 +42,12 @@ def kl_values(kl: Callable) -> None:
     mu, logvar, _ = codes()
     normal = torch.distributions.Normal
     sigma, variance = torch.exp(0.5 * logvar), logvar.exp()
-    each = torch.distributions.kl_divergence(normal(mu, sigma), normal(0.0, 1.0))
+
+    def each_of(mu: torch.Tensor, logvar: torch.Tensor) -> torch.Tensor:
+        given = normal(mu, torch.exp(0.5 * logvar))
+        return torch.distributions.kl_divergence(given, normal(0.0, 1.0))
+
+    each = each_of(mu, logvar)
     right = each.sum(1)
     mistakes = {
         "the factor 1/2 is missing": 2 * right,
@@ -55,7 +67,8 @@ def kl_values(kl: Callable) -> None:
         "this is the sum over all pictures too: keep one number for each": each.sum(),
         "this is the mean over all pictures: keep one number for each": right.mean(),
     }
-    check_gradients("kl(mu, logvar)", kl, (mu, logvar), right, mistakes)
+    given = mu, logvar
+    check_gradients("kl(mu, logvar)", kl, given, lambda *own: each_of(*own).sum(1), mistakes)
 
 
 def reparameterise_values(reparameterise: Callable) -> None:
@@ -74,9 +87,12 @@ def reparameterise_values(reparameterise: Callable) -> None:
         "mu and noise are exchanged: it is the noise that sigma scales": noise + sigma * mu,
         "this noise was sampled by you: use the one that is given": mu + sigma * own,
     }
-    right = mu + sigma * noise
+
+    def formula(mu: torch.Tensor, logvar: torch.Tensor, noise: torch.Tensor) -> torch.Tensor:
+        return mu + torch.exp(0.5 * logvar) * noise
+
     torch.manual_seed(0)
-    check_gradients(what, reparameterise, (mu, logvar, noise), right, mistakes)
+    check_gradients(what, reparameterise, (mu, logvar, noise), formula, mistakes)
     print("gradients reach mu and logvar, though z is a sample")
 
 
@@ -84,8 +100,8 @@ def active_latents(active: Callable) -> None:
     """The latents with more than 0.05 nats, and those with more than 1."""
     nats = np.array(
         [
-            [0.9, 0.4, 0.04, 2.0, 0.0, 0.0, 0.3],
             [0.3, 0.4, 0.04, 4.0, 0.06, 0.1, 0.02],
+            [0.9, 0.4, 0.04, 2.0, 0.0, 0.0, 0.5],
             [0.3, 0.4, 0.03, 3.0, 0.0, 0.0, 0.02],
         ]
     )
@@ -97,7 +113,8 @@ def active_latents(active: Callable) -> None:
         "these have a median above 0.05: take the mean over the frames": [3, 0, 1],
         "this is the median over the frames: take the mean": [3, 1, 0],
         "this is the order of the numbers, not of the nats: sort by the nats": [0, 1, 3, 6],
-        once: [3, 0, 1, 6, 5, 4],
+        once: [3, 0, 6, 1, 5, 4],
+        "the largest KL of any frame was sorted: take the mean over the frames": [3, 0, 6, 1],
         missing: [3, 0, 1, 6, 2, 5, 4],
         "this says which latents are active, as bools: return their numbers": nats.mean(0) > 0.05,
         "these are nats: return the numbers of the latents": nats.mean(0)[[3, 0, 1, 6]],
@@ -132,7 +149,13 @@ def silenced(silence: Callable) -> None:
 
 def reactions(reaction: Callable, encode: Callable) -> None:
     """The reaction of a V that one can compute by hand, at strides 4 and 2."""
-    vae, brightness = SimpleNamespace(encode=encode), np.arange(120) ** 2 // 60
+    brightest: list[float] = []  # what V is given must lie between 0 and 1
+
+    def note(frame: torch.Tensor, difference: torch.Tensor) -> tuple:
+        brightest.append(float(frame.max()))
+        return encode(frame, difference)
+
+    vae, brightness = SimpleNamespace(encode=note), np.arange(120) ** 2 // 60
     film = np.ones((120, 64, 64, 3), np.uint8) * brightness.astype(np.uint8)[:, None, None, None]
     expected = {}
     for k in (4, 2):
@@ -153,6 +176,9 @@ def reactions(reaction: Callable, encode: Callable) -> None:
         }
         what = f"reaction(vae, film, {k})"
         check(what, ask(what, reaction, vae, film, k), right, mistakes)
+        if max(brightest, default=0) > 1:
+            remedy = "use to_tensors, which divides them by 255"
+            raise WrongAnswer(what, "V was given frames from 0 to 255, not from 0 to 1", remedy)
 
 
 def mean_intervals(mean_interval: Callable) -> None:

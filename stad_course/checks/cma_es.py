@@ -50,24 +50,27 @@ def weights_of_ranks(weights: Callable) -> None:
 
 
 def new_means(new_mean: Callable) -> None:
-    """The mean of the better half of ten points."""
+    """The mean of the better half of ten points, and of seven."""
     source = np.random.default_rng(1)
-    population, fitness = source.standard_normal((10, 3)), source.permutation(np.arange(10.0))
-    order, w = np.argsort(fitness), right_weights(10)
-    best = population[order]
-    mistakes = {
-        "this is the mean of the worst: fitness is a cost here, low is good": w @ best[:4:-1],
-        "this is the plain mean of the better half: weigh it": best[:5].mean(axis=0),
-        "this is the mean of all points: selection is missing": population.mean(axis=0),
-        "the population was not sorted: take the rows in the order of their fitness": w
-        @ population[:5],
-        "these are the rows at the ranks: argsort once, the best come first": w
-        @ population[np.argsort(order)[:5]],
-        "the weights are turned round: the best point has the first": w[::-1] @ best[:5],
-        "this is the best point alone: one chance score would steer CMA-ES": best[0],
-    }
-    found = ask("new_mean", new_mean, population, fitness)
-    check("new_mean", found, w @ best[:5], mistakes, tolerance=1e-3)
+    for size in (10, 7):
+        population, fitness = source.standard_normal((size, 3)), 1.0 * source.permutation(size)
+        order, w, half = np.argsort(fitness), right_weights(size), size // 2
+        best = population[order]
+        mistakes = {
+            "this is the mean of the worst: fitness is a cost here, low is good": w
+            @ best[::-1][:half],
+            "this is the plain mean of the better half: weigh it": best[:half].mean(axis=0),
+            "this is the mean of all points: selection is missing": population.mean(axis=0),
+            "the population was not sorted: take the rows in the order of their fitness": w
+            @ population[:half],
+            "these are the rows at the ranks: argsort once, the best come first": w
+            @ population[np.argsort(order)[:half]],
+            "the weights are turned round: the best point has the first": w[::-1] @ best[:half],
+            "this is the best point alone: one chance score would steer CMA-ES": best[0],
+        }
+        what = f"new_mean of {size} points"
+        found = ask(what, new_mean, population, fitness)
+        check(what, found, w @ best[:half], mistakes, tolerance=1e-3)
 
 
 def ablated(ablate: Callable) -> None:

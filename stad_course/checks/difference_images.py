@@ -134,6 +134,7 @@ def interval(correlation_interval: Callable) -> None:
     labels = 10 * unit + 3  # names of the units: they need not count from 0
     x = source.standard_normal(240)
     y = 0.7 * x + 1.5 * source.standard_normal(12)[unit] * x + 0.3 * source.standard_normal(240)
+    mixed = source.permutation(240)  # the rows of a unit need not follow each other
     bounds = {
         "far too narrow: you drew rows, but rows of one unit are alike; draw whole units": (
             0.20,
@@ -149,7 +150,7 @@ def interval(correlation_interval: Callable) -> None:
             0.75,
         ),
     }
-    given = x, y, labels, np.random.default_rng(0), 10_000
+    given = x[mixed], y[mixed], labels[mixed], np.random.default_rng(0), 10_000
     check_interval(
         "correlation_interval", correlation_interval, given, (-0.14, 0.788), bounds, 0.04
     )

@@ -1,6 +1,6 @@
 """Checks of the exercises to notebook 03. Each takes the student's functions."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -19,15 +19,19 @@ def mixtures() -> tuple[torch.Tensor, ...]:
 
 
 def log_density_values(log_density: Callable) -> None:
-    """The log density of targets near the mixtures."""
+    """The log density of targets near the mixtures, of (4, 6) and of (2, 2, 6)."""
     target = torch.rand(4, 6, generator=torch.Generator().manual_seed(3))
     check_log_density(log_density, mixtures()[:3], target, "log_density")
+    deeper = [part.reshape(2, 2, 6, 5) for part in mixtures()[:3]]
+    what = "log_density of (2, 2, 6) targets"
+    check_log_density(log_density, deeper, target.reshape(2, 2, 6), what)
 
 
 def log_density_far(log_density: Callable) -> None:
     """The log density a thousand away, where every density is 0 in the computer.
 
-    There 136 nats are within the tolerance, so the formula is checked near the mixtures before.
+    There 136 nats are within the tolerance, so the formula is checked near the mixtures before, and
+    40 away afterwards.
     """
     logpi, mean, _, equal = mixtures()
     far, what = torch.full((4, 6), 1e3), "log_density, 1000 away"
@@ -38,12 +42,14 @@ def log_density_far(log_density: Callable) -> None:
         raise WrongAnswer(what, wrong, hint)
     log_density_values(log_density)
     check_log_density(log_density, (logpi, mean, equal), far, what)
+    nearer = torch.full((4, 6), 40.0)
+    check_log_density(log_density, (logpi, mean, equal), nearer, "log_density, 40 away")
 
 
 def check_log_density(
-    log_density: Callable, mixture: tuple, target: torch.Tensor, what: str
+    log_density: Callable, mixture: Sequence, target: torch.Tensor, what: str
 ) -> None:
-    """Check a log density of targets (4, 6)."""
+    """Check a log density of targets."""
     logpi, mean, logsigma = mixture
     each, shift = Normal(mean, logsigma.exp()).log_prob(target[..., None]), 0.5 * np.log(2 * np.pi)
     choice = Categorical(logits=logpi)
@@ -60,7 +66,7 @@ def check_log_density(
         ),
         "logsigma was taken for ln sigma squared: it is ln sigma, so take its exponential": halved,
         "these are logarithms of negative numbers: logpi is a logarithm already, so add it": (
-            torch.full((4, 6), torch.nan)
+            torch.full(target.shape, torch.nan)
         ),
         "logarithms were added: densities add up, so use logsumexp over the Gaussians": (
             logpi + each
@@ -107,6 +113,12 @@ def moments_of_mixtures(moments: Callable) -> None:
     centers[f"logpi, which is negative, was taken as the weight: {weigh}"] = (logpi * mean).sum(-1)
     check("the mean", found[0], both.mean, centers)
     check("the deviation", found[1], both.stddev, mistakes)
+    what = "moments of (2, 2, 6) mixtures"
+    deeper = (part.reshape(2, 2, 6, 5) for part in (logpi, mean, widths))
+    found = ask(what, moments, *deeper)
+    look = "sum over the last axis, dim=-1"
+    for part, right in zip(found, (both.mean, both.stddev), strict=True):
+        check(what, part, right.reshape(2, 2, 6), look=look)
 
 
 def horizons(horizon: Callable) -> None:
@@ -130,6 +142,12 @@ def horizons(horizon: Callable) -> None:
         "this is the place of a column: steps count from 1, so add 1": 1,
     }
     check(what, ask(what, horizon, twice, constant[:, :4]), 2, mistakes)
+    what, equal = (
+        "horizon, if they err equally at first",
+        np.column_stack([dream[:, 0], constant[:, 0], dream[:, 4]]),
+    )
+    mistakes = {"at this step both err equally: find the first where the dreams err more": 2}
+    check(what, ask(what, horizon, equal, constant[:, :3]), 3, mistakes)
     what = "horizon, if dreams never err more"
     mistakes = {
         "argmax of no True at all is 0: ask first whether there is one": 1,
