@@ -242,7 +242,7 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
 
 def drawable(claims: dict) -> set[str]:
     """The names of FIGURES whose data there are: study 5 has one when a part is complete."""
-    return set(FIGURES) - (set() if claims["study5"]["comparisons"] else {"study5"})
+    return {name for name in FIGURES if name != "study5" or claims["study5"]["comparisons"]}
 
 
 def image(name: str, claims: dict) -> str:

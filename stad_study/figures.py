@@ -49,8 +49,7 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
     variants = [variant for variant in COLOURS if variant != "frame"]
     figure, axes = new_figure(8.0, 4.6, 2, 1, sharex=True)
     for axis, (features, title) in zip(axes[:, 0], SEEN.items(), strict=True):
-        axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
-        axis.axvline(0, color="black", linewidth=0.8)
+        draw_margin(axis, margin)
         if features == "z, h":  # what the paper's C sees
             paper = f"paper, input_output: {reported:+.0f}"
             axis.axvline(reported, color="black", linestyle="--", label=paper)
@@ -59,7 +58,7 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
         name_rows(axis, variants)
         axis.set_title(title, loc="left", fontsize=10)
     axes[1, 0].set_xlabel("mean return less that of frame with the same seed, points")
-    name_marks(figure, axes[0, 0])
+    legend_below(figure, axes[0, 0])
     told = []
     for features, seen in SEEN.items():
         named = ((variant, comparisons[f"{features}: {variant}"]) for variant in variants)
@@ -68,6 +67,12 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
     pairs = len(comparisons["z: input"]["by_seed"])
     lead = f"Means, 95% intervals, a circle for each of {pairs} seeds. "
     return describe(figure, "Study 1: points more or less than frame", lead, [". ".join(told)])
+
+
+def draw_margin(axis: Axes, margin: float) -> None:
+    """The band of a forest plot in which differences are not relevant, and its zero line."""
+    axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
+    axis.axvline(0, color="black", linewidth=0.8)
 
 
 def plot_comparison(axis: Axes, height: float, one: dict, colour: str) -> None:
@@ -95,21 +100,14 @@ def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
     titles = {name: title.replace("`", "") for name, title in CAUSE.items()}
     rows = {title: comparisons[name] for name, title in titles.items() if name in comparisons}
     figure, ((axis,),) = new_figure(8.6, 1.4 + 0.55 * len(rows))
-    axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
-    axis.axvline(0, color="black", linewidth=0.8)
+    draw_margin(axis, margin)
     for height, one in enumerate(rows.values()):
         plot_comparison(axis, height, one, COLOURS["input_output"])
     name_rows(axis, [title.replace(", less", ",\nless") for title in rows])
     axis.set_xlabel("difference, points")
-    name_marks(figure, axis)
+    legend_below(figure, axis)
     told = [f"{title} {difference_of(one)}" for title, one in rows.items()]
     return describe(figure, "Study 5: what explains the gain", "Means: ", ["; ".join(told)])
-
-
-def name_marks(figure: Figure, axis: Axes) -> None:
-    """A legend below the figure, a line for each kind of mark of an axis."""
-    handles = {name: one for one, name in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, fontsize=9)
 
 
 def plot_scores(arms: dict[str, dict]) -> Figure:
@@ -205,14 +203,13 @@ def plot_primary(comparisons: dict[str, dict], margin: float) -> Figure:
         comparisons, margin: as of `plot_study`.
     """
     figure, ((axis,),) = new_figure(7.6, 2.5)
-    axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
-    axis.axvline(0, color="black", linewidth=0.8)
+    draw_margin(axis, margin)
     primary = {seen: comparisons[f"{name}: input_output"] for name, seen in SEEN.items()}
     for height, one in enumerate(primary.values()):
         plot_comparison(axis, height, one, COLOURS["input_output"])
     name_rows(axis, primary)
     axis.set_xlabel("points more or less than without difference images")
-    name_marks(figure, axis)
+    legend_below(figure, axis)
     told = [f"{seen} {difference_of(one)}, {one['verdict']}" for seen, one in primary.items()]
     lead = f"Means of {len(one['by_seed'])} seeds with 95% intervals: "
     return describe(figure, "What difference images change", lead, ["; ".join(told)])

@@ -7,7 +7,7 @@ from stad_study.claims import PAPER_GAINS
 from stad_study.study_claims import LEVEL, MARGIN
 
 PAPER_GAIN = PAPER_GAINS["input_output"]
-CAUSE = {  # test of study 5 -> what is compared, and what differs
+CHANGED = {  # test of study 5 -> what is compared, and what differs
     "interaction": ("z instead of z and h", "the effect of `input_output`"),
     "input_output less input": ("`input_output` instead of `input`", "the score of both C"),
     "adding motion": ("the true motion instead of another episode's", "the score of `frame`"),
@@ -73,12 +73,12 @@ def describe_cause(study: dict) -> list[str]:
     """
     comparisons = study["comparisons"]
     told = []
-    for name, (change, what) in CAUSE.items():
+    for name, (change, what) in CHANGED.items():
         if name in comparisons:
             one = comparisons[name]
             points = f"{one['difference']:+.1f} points"
             told.append(f"With {change}, {what} changes by {points}: *{one['verdict']}*.")
-    if set(CAUSE) <= set(comparisons):
+    if set(CHANGED) <= set(comparisons):
         told.append(read_cause(comparisons))
     return told
 

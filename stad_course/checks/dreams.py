@@ -142,10 +142,8 @@ def horizons(horizon: Callable) -> None:
         "this is the place of a column: steps count from 1, so add 1": 1,
     }
     check(what, ask(what, horizon, twice, constant[:, :4]), 2, mistakes)
-    what, equal = (
-        "horizon, if they err equally at first",
-        np.column_stack([dream[:, 0], constant[:, 0], dream[:, 4]]),
-    )
+    what = "horizon, if they err equally at first"
+    equal = np.column_stack([dream[:, 0], constant[:, 0], dream[:, 4]])
     mistakes = {"at this step both err equally: find the first where the dreams err more": 2}
     check(what, ask(what, horizon, equal, constant[:, :3]), 3, mistakes)
     what = "horizon, if dreams never err more"

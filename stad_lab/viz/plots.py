@@ -66,8 +66,9 @@ def name_rows(axis: Axes, names: Iterable[str]) -> None:
 
 
 def legend_below(figure: Figure, axis: Axes) -> None:
-    """A legend below the figure, of all that an axis names."""
-    figure.legend(*axis.get_legend_handles_labels(), loc="outside lower center", ncols=4, **SMALL)
+    """A legend below the figure, of all that an axis names, each name once."""
+    named = {name: one for one, name in zip(*axis.get_legend_handles_labels(), strict=True)}
+    figure.legend(named.values(), named, loc="outside lower center", ncols=4, **SMALL)
 
 
 def to_png(figure: Figure) -> bytes:
