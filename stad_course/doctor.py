@@ -14,6 +14,10 @@ from dataclasses import dataclass
 from html import escape
 from importlib.metadata import PackageNotFoundError, metadata, requires, version
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 GREEN, AMBER, RED = "green", "amber", "red"
 COLORS = {GREEN: "#009E73", AMBER: "#E69F00", RED: "#D55E00"}
@@ -22,9 +26,10 @@ LIMITS = Path("/sys/fs/cgroup")  # of a container, on Linux
 MODULES = (
     *("numpy", "scipy", "pandas", "cv2", "torch", "gymnasium", "Box2D", "pygame", "cma"),
     *("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl"),
+    *("matplotlib", "PIL", "ipywidgets"),
 )
-NEEDED = ("", "train")  # extras without which no agent can be trained or driven
-OPTIONAL_MODULES = ("matplotlib", "PIL", "ipywidgets", "distributed")  # of the extras
+NEEDED = ("", "train", "lab")  # extras without which a notebook does not run
+OPTIONAL_MODULES = ("distributed",)  # of the other extras
 
 
 @dataclass(frozen=True)
@@ -89,8 +94,8 @@ class Report:
 
 def check_environment(folder: str | Path = ".") -> Report:
     """Look at everything, `folder` being where you work; a check that raises gives a red line."""
-    checks = (check_python, check_packages, check_imports, check_preset, check_weights, check_drive)
-    further = (check_processors, check_memory, check_gpu, check_widgets)
+    checks = (check_python, check_packages, check_extras, check_imports, check_preset)
+    further = (check_weights, check_drive, check_processors, check_memory, check_gpu, check_widgets)
     lines = [line for check in (*checks, *further) for line in attempt(check)]
     return Report((*lines, *attempt(check_folder, Path(folder))))
 
@@ -125,30 +130,45 @@ def check_python() -> Iterator[Line]:
 
 
 def check_packages() -> Iterator[Line]:
-    """The versions of all required packages, and what the extras lack."""
-    from packaging.requirements import Requirement
-
-    extras: dict[str, list[str]] = {
-        extra: [] for extra in metadata("stad_lab").get_all("Provides-Extra") or ()
-    }
-    for requirement in map(Requirement, requires("stad_lab") or ()):
-        marker, name = requirement.marker, requirement.name
-        found = installed_version(name)
-        if not marker or any(marker.evaluate({"extra": extra}) for extra in NEEDED):
-            yield compare(name, found, str(requirement.specifier), INSTALL)
-        elif found is None or not requirement.specifier.contains(found, prereleases=True):
-            for extra in extras:
-                if marker.evaluate({"extra": extra}):
-                    extras[extra].append(f"{name} ({found or 'missing'})")
-    for extra, lacking in extras.items():
-        if extra in NEEDED:
-            continue
-        found = f"incomplete: {', '.join(lacking)}" if lacking else "complete"
-        remedy = f"only if you need this extra: pip install 'stad_lab[{extra}]'"
-        yield judge(not lacking, f"extra {extra}", found, remedy, AMBER)
+    """The versions of all packages that the notebooks need."""
+    for requirement in requirements(*NEEDED):
+        name, wanted = requirement.name, str(requirement.specifier)
+        yield compare(name, installed_version(name), wanted, INSTALL)
     if found := installed_version("box2d-py"):
         found += ", which overwrites the module `Box2D` of box2d"
         yield Line(RED, "box2d-py", found, f"pip uninstall box2d-py box2d, then {INSTALL}")
+
+
+def check_extras() -> Iterator[Line]:
+    """What the extras lack that no notebook needs; one that is wholly absent is not wanted."""
+    for extra in metadata("stad_lab").get_all("Provides-Extra") or ():
+        if extra in NEEDED:
+            continue
+        own = {one.name: one.specifier for one in requirements(extra)}
+        found = {name: installed_version(name) for name in own}
+        lacking = [
+            f"{name} ({version or 'missing'})"
+            for name, version in found.items()
+            if version is None or not own[name].contains(version, prereleases=True)
+        ]
+        if not any(found.values()):
+            yield Line(GREEN, f"extra {extra}", "not installed; no notebook needs it")
+            continue
+        remedy = f"only if you need this extra: pip install 'stad_lab[{extra}]'"
+        text = f"incomplete: {', '.join(lacking)}" if lacking else "complete"
+        yield judge(not lacking, f"extra {extra}", text, remedy, AMBER)
+
+
+def requirements(*extras: str) -> list["Requirement"]:
+    """What stad_lab requires with these extras, "" being none; without stad_lab itself."""
+    from packaging.requirements import Requirement
+
+    found = []
+    for requirement in map(Requirement, requires("stad_lab") or ()):
+        marker, always = requirement.marker, "" in extras and not requirement.marker
+        if always or (marker and any(marker.evaluate({"extra": extra}) for extra in extras)):
+            found.append(requirement)
+    return [one for one in found if one.name != "stad_lab"]
 
 
 def installed_version(name: str) -> str | None:
@@ -311,4 +331,4 @@ def check_widgets() -> Iterator[Line]:
     good = any((folder / "jupyterlab-manager").exists() for folder in folders)
     found = version("jupyterlab_widgets") if good else "is missing: no slider is shown"
     remedy = "pip install --force-reinstall jupyterlab_widgets, then start JupyterLab again"
-    yield judge(good, "widgets", f"jupyterlab_widgets {found}", remedy, AMBER)
+    yield judge(good, "widgets", f"jupyterlab_widgets {found}", remedy)

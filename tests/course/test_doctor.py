@@ -100,11 +100,11 @@ def packages(monkeypatch):
                 raise PackageNotFoundError(name)
             return versions[name]
 
-        extras = SimpleNamespace(get_all=lambda key: ["lab", "cluster"])
+        extras = SimpleNamespace(get_all=lambda key: ["lab", "tensorboard", "cluster"])
         monkeypatch.setattr(doctor, "requires", lambda name: requirements)
         monkeypatch.setattr(doctor, "metadata", lambda name: extras)
         monkeypatch.setattr(doctor, "version", version)
-        return doctor.Report(tuple(doctor.check_packages()))
+        return doctor.Report((*doctor.check_packages(), *doctor.check_extras()))
 
     return set_packages
 
@@ -122,29 +122,48 @@ def test_a_missing_package_and_a_wrong_version_are_red_with_what_is_needed(packa
     assert all(line.name != "pywin32" for line in report.lines)
 
 
-def test_what_an_extra_lacks_is_amber_because_only_some_need_it(packages):
-    requirements = ["numpy>=2", "ipywidgets>=8; extra == 'lab'", "jupyterlab>=4; extra == 'lab'"]
-    requirements += ["distributed; extra == 'cluster'"]
-    report = packages(requirements, {"numpy": "2.1", "jupyterlab": "3.0", "distributed": "2026.1"})
+def test_what_the_notebooks_lack_is_red_and_what_another_extra_lacks_is_amber(packages):
+    requirements = [
+        "numpy>=2",
+        "ipywidgets>=8; extra == 'lab'",
+        "stad_lab[lab]; extra == 'cluster'",
+    ]
+    requirements += ["distributed>=2; extra == 'cluster'", "bokeh; extra == 'cluster'"]
+    report = packages(requirements, {"numpy": "2.1", "distributed": "1.0"})
+    assert not report.ok and line(report, "ipywidgets").found.startswith("missing for")
+    report = packages(requirements, {"numpy": "2.1", "distributed": "1.0", "ipywidgets": "8.1"})
     assert report.ok
-    lab = line(report, "extra lab")
-    assert lab.state == "amber" and "stad_lab[lab]" in lab.remedy
-    assert lab.found == "incomplete: ipywidgets (missing), jupyterlab (3.0)"
-    assert line(report, "extra cluster").state == "green"
+    cluster = line(report, "extra cluster")
+    assert cluster.state == "amber" and "stad_lab[cluster]" in cluster.remedy
+    assert cluster.found == "incomplete: distributed (1.0), bokeh (missing)"
     assert report._repr_html_().startswith("<details><summary>")  # nothing to be done: one line
 
 
-def test_optional_libraries_may_be_missing_but_not_broken(monkeypatch):
+def test_an_extra_of_which_nothing_is_installed_is_no_drawback(packages):
+    report = packages(["numpy>=2", "tensorboard; extra == 'tensorboard'"], {"numpy": "2.1"})
+    assert line(report, "extra tensorboard").state == "green"
+
+
+def test_a_jupyterlab_that_shows_no_widgets_is_red(monkeypatch):
+    monkeypatch.setattr("jupyter_core.paths.jupyter_path", lambda *_: ["/nowhere"])
+    (found,) = doctor.check_widgets()
+    assert found.state == "red" and "no slider is shown" in found.found
+
+
+def test_libraries_of_other_extras_may_be_missing_but_not_broken(monkeypatch):
     found = importlib.util.find_spec
 
     def import_module(name):
-        if name in ("matplotlib", "cv2"):
+        if name in ("distributed", "cv2"):
             raise OSError("libGL.so.1: cannot open shared object file")
 
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: name != "PIL" and found(name))
     monkeypatch.setattr("importlib.import_module", import_module)
     states = {line.name: line.state for line in doctor.check_imports()}
-    assert states == {"import cv2": "red", "import matplotlib": "amber"}
+    assert states == {"import cv2": "red", "import distributed": "amber"}
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: name != "distributed" and found(name)
+    )
+    assert [line.name for line in doctor.check_imports()] == ["import cv2"]
 
 
 def test_a_black_picture_is_red(monkeypatch):
