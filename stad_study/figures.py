@@ -187,13 +187,12 @@ def representation(study3: dict, driver: str) -> dict[str, dict]:
 def plot_probe(panels: dict[str, dict], title: str) -> Figure:
     """Panels of R2, whose alternative text has the means from z of what a frame does not show."""
     figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
-    told = [
-        f"{panel} of {row} {round(one['from z'][0], 2) + 0.0:.2f}"
-        for panel, rows in panels.items()
-        if panel.startswith(TURNING)
-        for row, one in rows.items()
-    ]
-    return describe(figure, title, "Mean R2 from z: ", told)
+    told = []
+    for panel, rows in panels.items():
+        if panel.startswith(TURNING):
+            means = [f"{row} {round(one['from z'][0], 2) + 0.0:.2f}" for row, one in rows.items()]
+            told.append(f"{panel}: {', '.join(means)}")
+    return describe(figure, title, "Mean R2 from z. ", ["; ".join(told)])
 
 
 def plot_primary(comparisons: dict[str, dict], margin: float) -> Figure:

@@ -26,6 +26,8 @@ def study_with(words):
     """A finished study with these verdicts for z, and for z and h."""
     comparisons = {}
     for features, word in zip(FEATURES, words, strict=True):
+        other = {"difference": 3.0, "interval": [-9.0, 15.0], "by_seed": [15.0], "verdict": word}
+        comparisons[f"{features}: input"] = other
         interval, p = OUTCOMES[word]
         found = {"difference": sum(interval) / 2, "interval": interval, "holm_p": p}
         found |= {"verdict": find_verdict(interval, p), "seeds_that_decide": 121}
@@ -37,12 +39,12 @@ def study_with(words):
 
 @pytest.mark.parametrize("words", PAIRS)
 def test_every_pair_of_verdicts_is_told_with_its_intervals(words):
-    both, alone, interaction, _ = describe_verdict(study_with(words))
+    both, alone, interaction, *_ = describe_verdict(study_with(words))
     assert "p = 0.075" in interaction and "not significant" in interaction
     for sentence, word in ((alone, words[0]), (both, words[1])):
         (low, high), _ = OUTCOMES[word]
         assert f"*{word}*" in sentence and f"{low:.1f} to {high:.1f}" in sentence
-        assert ("trails" in sentence) == (low + high < 0)
+        assert f"is {(low + high) / 2:+.1f} points" in sentence
         assert ("121 seeds would decide" in sentence) == (word == "undecided")
 
 
@@ -54,11 +56,17 @@ def test_the_finding_of_the_overview_has_at_most_80_words():
 
 def test_the_gains_of_the_paper_are_compared_with_every_interval():
     gain = describe_verdict(study_with(("gain", "harm")))[-1]
-    assert "75 to 79 points, above 1 of the 2 intervals of means; 3 of 6 single pairs" in gain
+    assert "75 to 79 points; 3 of the 4 intervals end below them, and 3 of 8 single pairs" in gain
     first, second = describe_verdict(study_with(("gain", "harm")))[:2]
-    assert "perhaps too few to matter" in second and "perhaps" not in first
+    assert "perhaps too small to matter" in second and "perhaps" not in first
     harm = describe_verdict(study_with(["harm"] * 2))[-1]
-    assert "above all 2 intervals" in harm
+    assert "all 4 intervals end below" in harm
+
+
+def test_the_other_variants_are_told_with_their_range_and_how_many_gain_or_harm():
+    told = describe_verdict(study_with(("gain", "undecided")))[3]
+    assert "Of the 2 differences" in told and "+3.0 to +3.0 points, 1 is a gain or a harm" in told
+    assert "none is a gain" in describe_verdict(study_with(["undecided"] * 2))[3]
 
 
 def cause_with(changed=()):
@@ -82,7 +90,10 @@ def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_f
         ("interaction", "the effect is larger with z"),
         ("adding motion", "adding the motion is a gain"),
         ("erasing motion", "erasing it is a harm"),
-        ("both with motion", "with the motion both variants earn the same"),
+        (
+            "both with motion",
+            "with the motion the variants differ by less than 30 points (not tested)",
+        ),
     ):
         reading = describe_cause(cause_with({name: [-31.0, 29.0]}))[-1]
         shown, _, not_shown = reading.partition("Not shown: ")
