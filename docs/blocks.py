@@ -93,8 +93,8 @@ def gains(claims: dict) -> str:
     differ = describe_interaction(study["afterwards"]["interaction"])
     text = (
         "Does it help to see and reconstruct what has moved? A paper says so. In our study of"
-        f" twelve pairs it adds {both} if the controller sees the memory, as it probably does there, and"
-        f" {alone} if it does not (95% intervals). {differ}"
+        f" twelve pairs it adds {both} if the controller sees the memory, as it probably does"
+        f" there, and {alone} if it does not (95% intervals). {differ}"
     )
     return text.replace(" -0 ", " 0 ")
 
