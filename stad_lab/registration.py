@@ -43,13 +43,17 @@ class RegisterLater:
         """Gymnasium's own spec, whose loader registers, too; None for any other module."""
         if name != "gymnasium":
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
+        sys.meta_path.remove(self)  # so that the others are asked
+        try:
+            spec = importlib.util.find_spec(name)
+        finally:
+            sys.meta_path.insert(0, self)  # to ask for a spec is not yet to import
         if spec and spec.loader:
             load = spec.loader.exec_module
 
             def load_and_register(module: ModuleType) -> None:
                 load(module)
+                sys.meta_path.remove(self)
                 register_environments()
 
             spec.loader.exec_module = load_and_register  # type: ignore[method-assign]  # on purpose

@@ -212,7 +212,14 @@ def test_the_controller_needs_numpy_alone():
     assert {one for one in loaded if {*map(normal, modules.get(one, []))} & own} == {"numpy"}
 
 
-@pytest.mark.parametrize("first", ["import gymnasium; import stad_lab", "import stad_lab"])
+@pytest.mark.parametrize(
+    "first",
+    [
+        "import gymnasium; import stad_lab",
+        "import stad_lab",
+        "import stad_lab, importlib.util; importlib.util.find_spec('gymnasium')",
+    ],
+)
 def test_the_environments_are_registered_whichever_is_imported_first(first):
     names = "'StadLab/CarRacing-v3', 'StadLab/Dream-v0'"
     code = f"{first}; import gymnasium; print(*map(gymnasium.spec, ({names})))"
