@@ -36,6 +36,7 @@ FINE_TUNING = {  # what it changes in the configuration of the run that it conti
 }
 # Beside these, what may differ from the earlier run.
 OPEN = (*FINE_TUNING["evolution"], "seed", "validation_tracks", "cars")
+TAKEN = (VAE_FILE, MDN_RNN_FILE, COMPONENTS_FILE)  # from the earlier run
 
 
 def fine_tuning_config(earlier: str | Path, **changes) -> Config:
@@ -83,13 +84,15 @@ def begin(config: Config, earlier: Path, folder: Path) -> bool:
     """
     if (folder / LOG).exists() and not (folder / START_FILE).exists():
         raise ValueError(f"{folder} holds a run that continues no other: choose another folder")
-    for name in (VAE_FILE, MDN_RNN_FILE, COMPONENTS_FILE):
-        if (earlier / name).exists() and not (folder / name).exists():
-            copy_file(earlier / name, folder)
+    taken = [name for name in TAKEN if (earlier / name).exists()]
+    there = [name for name in TAKEN if (folder / name).exists()]
+    for name in there:
+        if name not in taken or (earlier / name).read_bytes() != (folder / name).read_bytes():
+            raise ValueError(f"{folder / name} is not that of {earlier}: choose another folder")
+    for name in set(taken) - set(there):
+        copy_file(earlier / name, folder)
     path, world_model = folder / START_FILE, weights.load_world_model(folder)
-    parameters, metadata = weights.load_controller(earlier / CONTROLLER_FILE)
-    if any(metadata[name] != value for name, value in world_model.checksums.items()):
-        raise ValueError(f"{folder} holds another V or M than {earlier}: choose another folder")
+    parameters, _ = weights.load_controller(earlier / CONTROLLER_FILE)
     if path.exists():
         if not np.array_equal(load_start(path, world_model), parameters):
             raise ValueError(f"{folder} continues from another C than that of {earlier}")

@@ -16,7 +16,7 @@ from stad_lab.io.weights import load_controller, load_world_model, save_controll
 from stad_lab.training.evolution import LOG, generation_tracks
 from stad_lab.training.fine_tuning import FINE_TUNING, begin, fine_tune, fine_tuning_config
 from stad_lab.training.record import total_budget
-from stad_lab.training.subspace import load_start, search_space
+from stad_lab.training.subspace import COMPONENTS_FILE, load_start, search_space
 from stad_study.ship import ship
 
 BRIEF = {"generations": 2, "population": 4, "tracks": 2, "validate_every": 1}
@@ -80,12 +80,15 @@ def test_its_episodes_and_agents_are_added_to_those_of_the_earlier_run(tuned, qu
 
 
 def test_a_folder_with_another_v_and_m_is_refused(quick_run, tmp_path):
+    earlier, folder = copy_run(quick_run, tmp_path / "earlier"), tmp_path / "run"
+    shutil.copy(PRETRAINED / "input" / COMPONENTS_FILE, earlier)
+    folder.mkdir()
     for part in ("vae", "mdn_rnn"):
-        shutil.copy(PRETRAINED / "input_output" / f"{part}.safetensors", tmp_path)
-    config, before = brief_config(quick_run), sorted(tmp_path.iterdir())
-    with pytest.raises(ValueError, match=r"holds another V or M than .*: choose another folder"):
-        begin(config, quick_run, tmp_path)
-    assert sorted(tmp_path.iterdir()) == before
+        shutil.copy(PRETRAINED / "input_output" / f"{part}.safetensors", folder)
+    config, before = brief_config(quick_run), sorted(folder.iterdir())
+    with pytest.raises(ValueError, match=r"vae.safetensors is not that of .*: choose another"):
+        begin(config, earlier, folder)
+    assert sorted(folder.iterdir()) == before
 
 
 def test_a_finished_run_is_not_fine_tuned_in_place(quick_run, tmp_path):
