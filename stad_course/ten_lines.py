@@ -51,10 +51,14 @@ def problem_of_ask(own: Ask) -> str:
     found, problem = run(own, mean, 0.5, count, np.random.default_rng(1), shape=(count, 3))
     if problem:
         return f"ask {problem}: expected an array (count, numbers)"
+    if not np.isfinite(found).all():
+        return "ask returns numbers that are not finite: add sigma times the random numbers"
     if np.abs(found.mean(axis=0) - mean).max() > 0.1:
         return "ask scatters around another point: add the mean"
     if np.abs(found.std(axis=0) - 0.5).max() > 0.1:
         return "ask scatters too far or not far enough: multiply the random numbers by sigma"
+    if np.abs(np.corrcoef(found.T) - np.eye(3)).max() > 0.1:
+        return "ask moves all numbers of a candidate together: draw one for each"
     return ""
 
 

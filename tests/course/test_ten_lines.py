@@ -34,6 +34,8 @@ def test_right_functions_are_used(capsys):
         (lambda mean, sigma, count, rng: mean, None, "ask returns an array of shape (3,)"),
         (lambda m, s, n, rng: s * rng.standard_normal((n, len(m))), None, "add the mean"),
         (lambda m, s, n, rng: m + rng.standard_normal((n, len(m))), None, "multiply"),
+        (lambda m, s, n, rng: m + rng.standard_normal((n, len(m))) ** s, None, "not finite"),
+        (lambda m, s, n, rng: m + s * rng.standard_normal((n, 1)), None, "one for each"),
         (None, lambda candidates, returns: None, "tell is not written yet"),
         (None, lambda candidates, returns: candidates.mean(axis=0), "keep the best quarter"),
         (None, lambda candidates, returns: candidates[returns.argmax()], "keeps one candidate"),
@@ -41,6 +43,7 @@ def test_right_functions_are_used(capsys):
         (None, lambda c, returns: c[np.argsort(returns)[:3]].mean(axis=0), "the worst"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # a root of a negative number
 def test_a_wrong_function_is_diagnosed_and_ours_is_used(own_ask, own_tell, said, capsys):
     chosen = ten_lines.yours_or_ours(own_ask or ten_lines.ask, own_tell or ten_lines.tell)
     assert chosen == (ten_lines.ask, ten_lines.tell)
