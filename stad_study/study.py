@@ -308,8 +308,9 @@ def check_settings(study: str, runs: pandas.DataFrame) -> None:
     for line in runs[runs["study"] == study].to_dict("records"):
         one = Pipeline(*(line[key] for key in PIPELINE))
         for name, value in flatten({"config": one.config.as_dict()}).items():
-            if line.get(name, value) != value:
-                raise ValueError(f"{study}/{one.name} has {name} {line[name]}, not {value}")
+            found = line.get(name)
+            if pandas.notna(found) and found != value:  # older runs lack a later setting
+                raise ValueError(f"{study}/{one.name} has {name} {found}, not {value}")
 
 
 def add_pipeline(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> None:

@@ -55,14 +55,20 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
 
 def read(name: str, folder: Path = DATA) -> pandas.DataFrame:
     """Read a table; ValueError if a column is missing or has gaps, or a line is there twice."""
-    (keys, values), path = TABLES[name], folder / f"{name}.csv"
+    path = folder / f"{name}.csv"
     table = pandas.read_csv(path, low_memory=False)
+    check_table(path, table)
+    return table
+
+
+def check_table(path: Path, table: pandas.DataFrame) -> None:
+    """ValueError if a column is missing or has gaps, or a line is there twice."""
+    keys, values = TABLES[path.stem]
     for column in keys + values:
         if column not in table or table[column].isna().any():
             raise ValueError(f"{path}: column {column!r} is missing or has empty cells")
     if (twice := table.duplicated(keys)).any():
         raise ValueError(f"{path}: more than one line for {table.loc[twice, keys].values[0]}")
-    return table
 
 
 def read_study(name: str, folder: Path = DATA) -> pandas.DataFrame:
@@ -171,7 +177,9 @@ def describe_record(record: dict) -> dict:
     """The line of `runs` for a record: settings, machine, times and budget, with dotted names."""
     line = flatten({"config": record.get("config", {})}) | record["made_with"]
     line |= {"variant": record["variant"], "config.variant": None}
-    line["continued_with"] = " ".join(one["commit"] for one in record.get("continued_with", []))
+    line["commit"] = line["commit"] or "unknown"
+    later = record.get("continued_with", [])
+    line["continued_with"] = " ".join(one["commit"] or "unknown" for one in later)
     line |= flatten({name: record.get(name, {}) for name in ("seconds", "budget")})
     line |= flatten(total_budget(record), "total.")
     return {name: value for name, value in line.items() if value is not None}
@@ -197,11 +205,15 @@ def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
 
 
 def save(name: str, table: pandas.DataFrame, folder: Path = DATA) -> None:
-    """Write a table in the order of its keys: floats with all digits, whole numbers without."""
-    keys = TABLES[name][0]
+    """Write a table in the order of its keys: floats with all digits, whole numbers without.
+
+    ValueError, before anything is written, for a table that `read` would refuse.
+    """
+    keys, path = TABLES[name][0], folder / f"{name}.csv"
+    check_table(path, table)
     table = table[keys + [column for column in table if column not in keys]].sort_values(keys)
     for column in table.select_dtypes("float"):  # gaps make floats of whole numbers
         if (table[column].dropna() % 1 == 0).all():
             table[column] = table[column].astype("Int64")
     text = table.to_csv(index=False, lineterminator="\n")
-    write_bytes(folder / f"{name}.csv", text.encode())
+    write_bytes(path, text.encode())

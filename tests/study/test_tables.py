@@ -26,6 +26,25 @@ def test_a_run_is_added_once_and_read_exactly(run, tmp_path):
     assert tables.read("runs", tmp_path)["config.evolution.tracks"].tolist() == [8, 8]
 
 
+def test_a_run_without_a_known_commit_is_added_and_continued_ones_are_counted(run, tmp_path):
+    record = load_json(run / "record.json")
+    record["made_with"]["commit"] = None
+    record["continued_with"] = [record["made_with"], record["made_with"] | {"commit": "ab12"}]
+    save_json(run / "record.json", record)
+    tables.add_run(run, "fine_tuned_frame", 0, tmp_path)
+    line = tables.read("runs", tmp_path).iloc[0]
+    assert (line["commit"], line["continued_with"]) == ("unknown", "unknown ab12")
+
+
+def test_a_table_that_could_not_be_read_again_is_not_written(run, tmp_path):
+    tables.add_run(run, "fine_tuned_frame", 0, tmp_path)
+    before = (tmp_path / "runs.csv").read_bytes()
+    table = tables.read("runs", tmp_path)
+    with pytest.raises(ValueError, match="column 'variant' is missing or has empty cells"):
+        tables.save("runs", table.assign(variant=None), tmp_path)
+    assert (tmp_path / "runs.csv").read_bytes() == before
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
