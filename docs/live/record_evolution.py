@@ -26,7 +26,7 @@ from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.trajectories import encode_trajectory, record_trajectory
 from stad_lab.io.files import load_json
 from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_controller, load_world_model
-from stad_lab.training.evolution import LOG, ask, fitness_curves, make_strategy, tell
+from stad_lab.training.evolution import LOG, fitness_curves, replay
 from stad_lab.training.record import RECORD
 from stad_lab.training.subspace import search_space
 
@@ -44,10 +44,8 @@ def mean_controllers(config: Config, folder: Path, world_model: WorldModel, log:
     The log's checksums hold on the machine that made the run alone; here the kept C must agree.
     """
     space = search_space(config, world_model, folder)
-    strategy, means = make_strategy(space.first, config.evolution, log["random"]), [space.first]
-    for number, entry in enumerate(log["generations"]):
-        tell(strategy, ask(strategy, config.evolution, number), entry["returns"], means)
-    controllers = [space.expand(mean) for mean in means]
+    _, means = replay(space.first, config.evolution, log, check=False)
+    controllers = [space.expand(mean) for mean in (space.first, *means)]
     kept, metadata = load_controller(folder / CONTROLLER_FILE)
     difference = np.abs(controllers[metadata["generation"]] - kept).max()
     if difference > 1e-6:

@@ -25,6 +25,7 @@ from stad_lab.io.files import (
     load_json,
     save_json,
 )
+from stad_lab.io.weights import CONTROLLER_FILE, load_controller
 from stad_lab.io.workers import run_tasks, worker_processes, worker_threads
 from stad_lab.training.evolution import drive_group, hand_out
 from stad_lab.training.pipeline import RUN_FILES
@@ -165,6 +166,20 @@ def load_evaluation(path: Path) -> dict:
         if not is_near(found.get(name), value):
             raise ValueError(f"{path} says {name}={found.get(name)}, its episodes give {value}")
     return found
+
+
+def evaluations_of(folder: Path) -> dict[Path, dict]:
+    """The evaluations in a folder by their files, of this C or of an earlier one."""
+    return {file: load_evaluation(file) for file in sorted(folder.glob("evaluation*.json"))}
+
+
+def is_of_agent(evaluation: dict, folder: Path) -> bool:
+    """Whether an evaluation is of the C in `folder`."""
+    if not (folder / CONTROLLER_FILE).exists():
+        return False
+    parameters, metadata = load_controller(folder / CONTROLLER_FILE)
+    drove = checksum_of_arrays(parameters=parameters), metadata["variant"]
+    return (evaluation["controller"], evaluation["variant"]) == drove
 
 
 def is_near(found: Any, value: float | list[float]) -> bool:

@@ -13,8 +13,8 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from stad_lab.config import Config
-from stad_lab.evaluation.evaluate import load_evaluation
-from stad_lab.io.files import checksum_of_arrays, load_json
+from stad_lab.evaluation.evaluate import evaluations_of, is_of_agent
+from stad_lab.io.files import load_json
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
     MDN_RNN_FILE,
@@ -151,11 +151,8 @@ def replayed_distance(folder: Path, config: Config, log: dict) -> float:
     if (last := evolution.kept_generation(folder, log)) is None:
         return np.inf
     space = search_space(config, load_world_model(folder), folder)
-    means: list[np.ndarray] = []
-    strategy = evolution.make_strategy(space.first, config.evolution, log["random"])
-    for number, entry in enumerate(log["generations"][:last]):
-        population = evolution.ask(strategy, config.evolution, number)
-        evolution.tell(strategy, population, entry["returns"], means)
+    kept_part = log | {"generations": log["generations"][:last]}
+    _, means = evolution.replay(space.first, config.evolution, kept_part, check=False)
     replayed = space.expand(evolution.averaged_mean(means, config.evolution))
     kept, _ = load_controller(folder / CONTROLLER_FILE)
     way = np.linalg.norm(kept - space.expand(space.first))
@@ -182,11 +179,9 @@ def verify_controller(folder: Path, config: Config) -> str:
 
 def verify_evaluations(folder: Path) -> str:
     """Check the evaluations in the folder, and that they are of this C."""
-    files = sorted(folder.glob("evaluation*.json"))
-    for file in files:
-        parameters, metadata = load_controller(folder / CONTROLLER_FILE)
-        found, drove = load_evaluation(file), checksum_of_arrays(parameters=parameters)
-        if (found["controller"], found["variant"]) != (drove, metadata["variant"]):
+    files = evaluations_of(folder)
+    for file, found in files.items():
+        if not is_of_agent(found, folder):
             raise ValueError(f"{file} is of another controller: evaluate again")
     return f"ok: {', '.join(file.name for file in files)}" if files else "none: not evaluated here"
 
@@ -194,7 +189,7 @@ def verify_evaluations(folder: Path) -> str:
 def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
     """Drive recorded episodes again: of an evaluation, or of the validation that chose C."""
     parameters, _ = load_controller(folder / CONTROLLER_FILE)
-    evaluations = [load_evaluation(file) for file in sorted(folder.glob("evaluation*.json"))]
+    evaluations = list(evaluations_of(folder).values())
     if not evaluations and not (folder / evolution.LOG).exists():
         return MISSING
     official = [one for one in evaluations if one["renderer"] == "gymnasium"]

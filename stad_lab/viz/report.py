@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from stad_lab.agent import load_agent
 from stad_lab.config import Config, fields_of
-from stad_lab.evaluation.evaluate import load_evaluation
+from stad_lab.evaluation.evaluate import evaluations_of, is_of_agent
 from stad_lab.evaluation.statistics import SOLVED, describe_tail
 from stad_lab.io.files import load_json
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_mdn_rnn, load_vae
@@ -38,8 +38,8 @@ def report(folder: Path) -> str:
 
 
 def scores(folder: Path) -> str:
-    """The evaluations in the folder, or what to do if there is none."""
-    found = [load_evaluation(file) for file in sorted(folder.glob("evaluation*.json"))]
+    """The evaluations of this C, or what to do if there is none."""
+    found = [one for one in evaluations_of(folder).values() if is_of_agent(one, folder)]
     if not found:
         command = html.escape(f"python -m stad_lab evaluate --agent {folder}")
         return f"<p>Not evaluated yet: <code>{command}</code></p>"
@@ -52,14 +52,16 @@ def scores(folder: Path) -> str:
             f"mean {one['mean']:.1f} (95% interval {low:.1f} to {high:.1f}), minimum"
             f" {tail['minimum']:.1f}, above {SOLVED}: {100 * one['above_900']:.0f}%"
         )
-    return f"<p class=number>Mean return {found[0]['mean']:.1f}</p>{table(rows)}"
+    official = [one["renderer"] == "gymnasium" for one in found]
+    best = max(range(len(found)), key=lambda n: (official[n], len(found[n]["episodes"])))
+    return f"<p class=number>Mean return {found[best]['mean']:.1f}</p>{table(rows)}"
 
 
 def film(folder: Path) -> str:
     """The agent at the wheel; nothing as long as there is no C."""
     if not (folder / CONTROLLER_FILE).exists():
         return ""
-    gif = film_agent(load_agent(str(folder)), **FILM)
+    gif = film_agent(load_agent(folder), **FILM)
     text = f"The agent on track {FILM['track']}: observation, difference image, reconstruction"
     text += " and dream"
     return f"<figure>{picture(gif, 'gif', text)}<figcaption>{text}.</figcaption></figure>"

@@ -1,8 +1,10 @@
 """A run in TensorBoard, while it goes on: losses, returns, step size, latents and films."""
 
+import functools
 import shutil
 from collections import Counter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,6 +19,9 @@ from stad_lab.evaluation.trajectories import (
 from stad_lab.io.weights import CONTROLLER_FILE, VAE_FILE, load_vae
 from stad_lab.training.evolution import fitness_curves
 from stad_lab.viz.video import FILM, film_agent
+
+if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
 
 FRAMES = 400  # of the episode whose latents are shown
 
@@ -34,11 +39,17 @@ class TensorBoard:
         except ImportError as error:
             remedy = "--tensorboard needs it: pip install 'stad_lab[tensorboard]'"
             raise ImportError(f"TensorBoard is not installed; {remedy}") from error
-        if folder.exists():
-            if any(folder.iterdir()) and not any(folder.glob("events.out.tfevents.*")):
-                raise ValueError(f"{folder}: not of TensorBoard, and would be replaced: move it")
-            shutil.rmtree(folder)
-        self.writer, self.written = SummaryWriter(str(folder)), Counter[str]()
+        there = list(folder.glob("*"))
+        if there and not any(folder.glob("events.out.tfevents.*")):
+            raise ValueError(f"{folder}: not of TensorBoard, and would be replaced: move it")
+        self.folder, self.open, self.written = folder, SummaryWriter, Counter[str]()
+
+    @functools.cached_property
+    def writer(self) -> "SummaryWriter":
+        """Opened with the first entry, so that a training which is refused erases nothing."""
+        if self.folder.exists():
+            shutil.rmtree(self.folder)
+        return self.open(str(self.folder))
 
     def __call__(self, stage: str, entries: list[dict]) -> None:
         """Add what is new in a stage's history, or in the generations of CMA-ES."""
@@ -53,7 +64,7 @@ class TensorBoard:
     def add_agent(self, folder: Path) -> None:
         """Add the film of a run's agent and the latents of its episode, if there is an agent."""
         if (folder / CONTROLLER_FILE).exists():
-            agent = load_agent(str(folder))
+            agent = load_agent(folder)
             self.add_film("agent", film_agent(agent, **FILM))
             self.add_latents(folder, record_trajectory(agent, FILM["track"], FRAMES))
         self.writer.close()

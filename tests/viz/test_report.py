@@ -2,12 +2,16 @@
 
 import re
 import shutil
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 from stad_lab.agent import PRETRAINED
 from stad_lab.cli import main
 from stad_lab.evaluation.evaluate import load_evaluation
+from stad_lab.evaluation.statistics import summarise
+from stad_lab.io.files import save_json
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE
 from stad_lab.viz.report import report
 
@@ -32,6 +36,27 @@ def test_the_report_of_a_shipped_agent_has_its_scores_film_and_curves():
     assert all(f"mean {mean:.1f}" in page for mean in means)
     assert pictures(page) == {"gif": 1, "png": 4}
     assert len(re.findall(r'alt="[^"]+"', page)) == 5
+
+
+def test_the_headline_is_the_full_evaluation_of_this_c_with_gymnasium_s_pictures(tmp_path):
+    folder = shutil.copytree(PRETRAINED / "frame", tmp_path / "run")
+    full = load_evaluation(folder / "evaluation.json")
+    some = full["episodes"][:5]
+    brief = full | {"episodes": some} | summarise(np.array([one["return"] for one in some]))
+    save_json(folder / "evaluation-5.json", brief)
+    save_json(folder / "evaluation-earlier.json", full | {"controller": "0"})
+    page = report(folder)
+    assert f"Mean return {full['mean']:.1f}" in page
+    assert "tracks 0 to 4," in page
+    (folder / "evaluation.json").unlink()
+    (folder / "evaluation-5.json").unlink()
+    assert "evaluate --agent" in report(folder)
+
+
+def test_a_run_whose_folder_has_the_name_of_a_shipped_agent_shows_its_own_film(run, monkeypatch):
+    film, own = re.compile('data:image/gif;base64,[^"]*'), run.rename(run.parent / "input")
+    monkeypatch.chdir(own.parent)
+    assert film.findall(report(Path("input"))) == film.findall(report(own))
 
 
 def test_a_report_asks_for_no_other_file(quick_run):

@@ -39,6 +39,12 @@ def test_losses_and_returns_are_those_of_the_run(told):
     )
 
 
+def test_a_training_that_is_refused_erases_no_events(told):
+    before = {path: path.stat().st_size for path in (told[0] / "tensorboard").rglob("*")}
+    assert main([*TRAIN, str(told[0]), "--seed", "1"]) == 2
+    assert {path: path.stat().st_size for path in before} == before
+
+
 def test_the_film_is_an_animation(told):
     (image,) = told[1].Images("agent")
     assert image.encoded_image_string.startswith(b"GIF89a")
