@@ -56,11 +56,10 @@ class TwoRuns(ipywidgets.VBox):
 
     Args:
         scores: of each run of two variants, (2, runs).
-        seed: of the deals.
     """
 
-    def __init__(self, scores: np.ndarray, seed: int = 0):
-        self.scores, self.rng = scores, np.random.default_rng(seed)
+    def __init__(self, scores: np.ndarray):
+        self.scores, self.rng = scores, np.random.default_rng(0)
         self.won, self.rounds = 0, 0
         self.reach = float(np.ptp(scores))
         self.picture, self.told = ipywidgets.HTML(), ipywidgets.HTML()

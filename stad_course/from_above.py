@@ -27,8 +27,11 @@ from stad_lab.viz.plots import (
     new_figure,
 )
 
+THREADS = 2  # that share the cars; the results do not depend on it
+BEND = 20  # tiles
 
-class Drives(NamedTuple):
+
+class Driven(NamedTuple):
     """One episode of each of n controllers."""
 
     returns: np.ndarray  # float64 (n,)
@@ -42,32 +45,30 @@ def drive(
     tracks: list[int],
     max_frames: int = 1000,
     patience: int = 0,
-    threads: int = 2,
-) -> Drives:
+) -> Driven:
     """Drive each controller, float64 (n, parameters), on its track with our engine.
 
     Args:
         tracks: n seeds.
         max_frames, patience: of `rollout`.
-        threads: that share the cars; the results do not depend on it.
     """
     if len(controllers) != len(tracks):
         raise ValueError(f"{len(controllers)} controllers on {len(tracks)} tracks: expected pairs")
-    groups = np.array_split(np.arange(len(tracks)), min(threads, len(tracks)))
+    groups = np.array_split(np.arange(len(tracks)), min(THREADS, len(tracks)))
     limits = max_frames, patience
     tasks = [(world_model, controllers[own], [tracks[i] for i in own], *limits) for own in groups]
     with worker_threads(len(groups)) as executor:
-        returns, paths, roads = zip(*run_in_order(executor, drive_group, tasks), strict=True)
-    return Drives(np.concatenate(returns), [*chain(*paths)], [*chain(*roads)])
+        returns, paths, roads = zip(*run_in_order(executor, drive_batch, tasks), strict=True)
+    return Driven(np.concatenate(returns), [*chain(*paths)], [*chain(*roads)])
 
 
-def drive_group(
+def drive_batch(
     world_model: WorldModel,
     controllers: np.ndarray,
     tracks: list[int],
     max_frames: int,
     patience: int,
-) -> Drives:
+) -> Driven:
     """Drive a batch of cars on one thread."""
     single_thread()
     cars = Cars(len(tracks), "frame", bar=not world_model.crop_bar)
@@ -81,7 +82,7 @@ def drive_group(
     agent = make_agent(world_model, controllers)
     episodes = rollout(agent, cars, max_frames, patience, observe=note)
     roads = [track.path[:, 2:] for track in cars.tracks]
-    return Drives(episodes.returns, [np.array(path) for path in paths], roads)
+    return Driven(episodes.returns, [np.array(path) for path in paths], roads)
 
 
 class Watched(NamedTuple):
@@ -107,8 +108,8 @@ def watch(agent: Agent, track: int) -> Watched:
     return Watched(recorder.trajectory(episodes.rewards[0]), np.array(path), road)
 
 
-def sharpest_bends(tracks: Iterable[int], tiles: int = 20) -> tuple[np.ndarray, np.ndarray]:
-    """The sharpest bend of each track over so many tiles, to the left and to the right.
+def sharpest_bends(tracks: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
+    """The sharpest bend of each track over BEND tiles, to the left and to the right.
 
     Returns:
         How far it turns, degrees, float64 (tracks, 2), and the tile where it begins, int64
@@ -118,7 +119,7 @@ def sharpest_bends(tracks: Iterable[int], tiles: int = 20) -> tuple[np.ndarray, 
     for track in tracks:
         cars.reset([track])
         heading = np.unwrap(cars.tracks[0].path[:, 1])
-        turned = heading[tiles:] - heading[:-tiles]  # radians to the left
+        turned = heading[BEND:] - heading[:-BEND]  # radians to the left
         degrees.append(np.degrees([turned.max(), -turned.min()]))
         begins.append([turned.argmax(), turned.argmin()])
     return np.array(degrees), np.array(begins)

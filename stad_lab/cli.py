@@ -208,7 +208,7 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
 
     Args:
         run: A shipped agent, or the folder of a run.
-        episodes: Of the random driver; an agent drives a third as many.
+        episodes: Of the random driver; an agent drives a third as many, at least 12.
         processes: Workers that drive.
         json: Where to write the result; by default into the run, or here for a shipped agent.
     """

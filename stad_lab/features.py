@@ -1,5 +1,7 @@
 """What C sees in a recorded episode: z of every frame, and M's memory h before it."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import torch
 
@@ -8,17 +10,22 @@ from stad_lab.io.weights import WorldModel
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE, to_tensor
 
-CHUNK = 250  # frames of an episode that V encodes at once
+CHUNK = 250  # frames that V encodes at once
+
+
+def chunks(frames: np.ndarray, earlier: np.ndarray) -> Iterator[list[torch.Tensor]]:
+    """What V sees of frames, uint8 (n, 64, 64, 3), and of the earlier ones, part by part."""
+    count = max(1, len(frames) // CHUNK)
+    for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
+        yield [to_tensor(picture) for picture in to_pictures(*pair)]
 
 
 @torch.no_grad()
 def encode_episode(vae: VAE, frames: np.ndarray, stride: int) -> np.ndarray:
     """V's mu and logvar for the frames of an episode, uint8 (T, 64, 64, 3) -> float32 (2, T, z)."""
-    device, count = next(vae.parameters()).device, max(1, len(frames) // CHUNK)
-    parts, earlier = [], earlier_frames(frames, stride)
-    for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
-        pictures = (to_tensor(picture).to(device) for picture in to_pictures(*pair))
-        parts.append(torch.stack(vae.encode(*pictures)))
+    device, parts = next(vae.parameters()).device, []
+    for pictures in chunks(frames, earlier_frames(frames, stride)):
+        parts.append(torch.stack(vae.encode(*(picture.to(device) for picture in pictures))))
     return torch.cat(parts, dim=1).cpu().numpy()
 
 

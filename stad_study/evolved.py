@@ -34,12 +34,12 @@ from stad_study import tables
 from stad_study.networks import NETWORKS
 from stad_study.senses import Sense
 from stad_study.study import (
-    CARS,
     SCORE,
     STUDIES,
     WAIT,
     Run,
     fixed_threads,
+    groups_of,
     refuse_finished,
     select,
 )
@@ -194,8 +194,8 @@ def score_controller(sense: Sense, controller: np.ndarray) -> dict:
     """Drive C, float16 (parameters,), on the tracks of study 1's score, in groups as there."""
     tracks, limits = list(STUDIES["study1"].tracks), {"max_frames": STUDIES["study1"].max_frames}
     parameters = controller.astype(np.float64)
-    groups = [tracks[start : start + CARS] for start in range(0, len(tracks), CARS)]
-    returns = np.concatenate([sense.drive(parameters, own, **limits).returns for own in groups])
+    driven = [sense.drive(parameters, own, **limits).returns for own in groups_of(tracks)]
+    returns = np.concatenate(driven)
     return {
         "mean": float(returns.mean()),
         "returns": returns.tolist(),

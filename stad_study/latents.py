@@ -24,7 +24,7 @@ from stad_lab.config import VARIANTS, Config, check_same, random_stream
 from stad_lab.envs.frames import earlier_frames
 from stad_lab.evaluation import metrics
 from stad_lab.evaluation.probe_run import (
-    FEWEST,
+    FEWEST_TRAJECTORIES,
     LONGEST_STRIDE,
     RANDOM_FRAMES,
     Encoder,
@@ -81,7 +81,7 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[st
     if unknown := [part for part in parts if part not in PARTS]:
         raise ValueError(f"unknown part {unknown[0]!r}: choose from {', '.join(PARTS)}")
     collect(config, dataset_folder)
-    count = max(FEWEST, config.data.episodes // 5)
+    count = max(FEWEST_TRAJECTORIES, config.data.episodes // 5)
     driven = random_trajectories(count, config.seed + 1, config.processes)
     given, file, result = Given(config, dataset_folder, work, driven), work / "latents.json", {}
     for name in parts:

@@ -13,7 +13,7 @@ from stad_lab.training.record import RECORD
 
 
 def ship(folder: str | Path, name: str) -> Path:
-    """Copy a run into `stad_lab/pretrained/NAME`: V, M and C in half precision, and its record.
+    """Copy a run into `stad_lab/pretrained/NAME`: V and M in half precision, C, and its record.
 
     Evaluate the shipped agent after this, not the run. Returns the new folder; what an agent of
     that name left there is removed. FileNotFoundError if the run has no V; ValueError if it is

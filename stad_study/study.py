@@ -276,6 +276,11 @@ def final_controller(config: Config, run: Path) -> np.ndarray:
     return resume(config, run, world_model, log).controller()
 
 
+def groups_of(tracks: Sequence[int]) -> list[Sequence[int]]:
+    """Tracks in the groups that drive as one batch."""
+    return [tracks[start : start + CARS] for start in range(0, len(tracks), CARS)]
+
+
 def drive_tracks(
     agent: Agent,
     tracks: Sequence[int],
@@ -289,7 +294,7 @@ def drive_tracks(
     Groups begin with the first track, so the same first track gives bit-identical returns.
     """
     tracks = list(tracks)
-    groups = [tracks[start : start + CARS] for start in range(0, len(tracks), CARS)]
+    groups = groups_of(tracks)
     with worker_threads(processes, executor) as executor:
         source = hand_out(executor, agent.world_model)
         tasks = [(source, agent.parameters, group, True, limits) for group in groups]

@@ -26,7 +26,7 @@ def describe_study2(folder: Path = tables.DATA) -> dict:
     found: dict[str, Any] = {
         **counts,
         "gate": {
-            str(episodes): {"scores": scores_of("frame", episodes, folder), "passed": passed}
+            str(episodes): {"scores": gate_scores(episodes, folder), "passed": passed}
             for episodes, passed in gates.items()
             if passed is not None
         },
@@ -45,10 +45,10 @@ def describe_study2(folder: Path = tables.DATA) -> dict:
     return found
 
 
-def scores_of(variant: str, episodes: int, folder: Path) -> list[float]:
-    """The scores of the gate's runs, seed by seed."""
+def gate_scores(episodes: int, folder: Path) -> list[float]:
+    """The scores of the gate's runs, which are of `frame`, seed by seed."""
     table = tables.read("study2_runs", folder).set_index(tables.BUDGET)["mean"]
-    return [float(table.loc[(seed, variant, episodes)]) for seed in GATE[episodes]]
+    return [float(table.loc[(seed, "frame", episodes)]) for seed in GATE[episodes]]
 
 
 def returns_of(variant: str, episodes: int, folder: Path) -> np.ndarray:

@@ -43,7 +43,7 @@ from stad_study.senses import (
     turning,
     whiten,
 )
-from stad_study.study import CARS, STUDIES
+from stad_study.study import STUDIES, groups_of
 
 WORLD_FILE = "world.safetensors"
 PLACEBO_EPISODES = 64  # of an agent, on tracks kept for inspection
@@ -92,8 +92,7 @@ def placebo_episodes() -> list[np.ndarray]:
     """The motion (T, 3) of whole episodes of an agent, on tracks kept for inspection."""
     agent, tracks = load_agent(AGENT), track_seeds("inspect", PLACEBO_EPISODES, 5)
     found = []
-    for start in range(0, len(tracks), CARS):
-        own = tracks[start : start + CARS]
+    for own in groups_of(tracks):
         cars = Cars(len(own), "frame", bar=not agent.world_model.crop_bar)
         rows: list[list] = [[] for _ in own]
         cars.reset(own)

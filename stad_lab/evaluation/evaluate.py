@@ -79,8 +79,8 @@ def evaluate(
         share = hand_out(executor, run_folder(source))
         tasks = [(share, agent.parameters, [track], fast) for track in missing]
         results = run_tasks(executor, drive_group, tasks)
-        shown = {"total": len(tracks), "initial": len(driven), "unit": "episode"}
-        for number, (returns, lengths) in tqdm(results, f"evaluate ({agent.vae.variant})", **shown):
+        bar = {"total": len(tracks), "initial": len(driven), "unit": "episode"}
+        for number, (returns, lengths) in tqdm(results, f"evaluate ({agent.vae.variant})", **bar):
             driven[str(missing[number])] = float(returns[0]), int(lengths[0])
             if unfinished:
                 write_unfinished(unfinished, asked, driven, time.perf_counter() - begin)

@@ -11,14 +11,14 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from stad_lab.envs.frames import difference_image, normalise, to_pictures
+from stad_lab.envs.frames import difference_image, normalise
+from stad_lab.features import chunks
 from stad_lab.models.mdn_rnn import MDNRNN, Mixture
-from stad_lab.models.vae import VAE, kl_divergence, to_array, to_tensor
+from stad_lab.models.vae import VAE, kl_divergence, to_array
 
 ACTIVE = 0.05  # nats; a latent with a smaller mean KL is called inactive
 CAR = (slice(50, 60), slice(29, 35))  # rows and columns of the car: the camera is fixed to it
 REGIONS = ("road", "grass", "car")
-CHUNK = 250  # frames that V reconstructs at once
 
 
 def region_masks(frames: np.ndarray) -> dict[str, np.ndarray]:
@@ -54,10 +54,9 @@ class Reconstruction(NamedTuple):
 @torch.no_grad()
 def reconstruct(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> Reconstruction:
     """Encode and decode frames, uint8 (n, 64, 64, 3), through the mean of z."""
-    count = max(1, len(frames) // CHUNK)
     parts = []
-    for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
-        mu, logvar = vae.encode(*map(to_tensor, to_pictures(*pair)))
+    for pictures in chunks(frames, earlier):
+        mu, logvar = vae.encode(*pictures)
         frame, difference = vae.decode(mu)
         changed = None if difference is None else to_array(difference)
         parts.append((to_array(frame), changed, kl_divergence(mu, logvar).numpy()))

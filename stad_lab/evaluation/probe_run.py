@@ -27,7 +27,7 @@ LONGEST_STRIDE = 8
 RANDOM_FRAMES, AGENT_FRAMES = 150, 360  # of a trajectory of the random driver, and of the agent
 # First frames that are not probed: without a difference image, or with the opening zoom.
 RANDOM_SKIP, AGENT_SKIP = LONGEST_STRIDE, 60
-FEWEST = 12  # trajectories: a probe is fitted on some and measured on others
+FEWEST_TRAJECTORIES = 12  # trajectories: a probe is fitted on some and measured on others
 PROBED, PROBE_SEED = 180, 100  # trajectories when one run is probed; no counted run has this seed
 AGENT = "cropped_input"  # the competent driver whose trajectories are probed
 
@@ -59,7 +59,9 @@ Driven = tuple[list[Trajectory], int]
 
 
 def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, Driven]:
-    """The random driver's trajectories, and a third as many of AGENT: the road at speed.
+    """The random driver's trajectories, and of AGENT, who is fast on the road, a third as many.
+
+    At least FEWEST_TRAJECTORIES.
 
     Returns driver -> (trajectories, number of first frames of each that are not probed).
     """
@@ -69,7 +71,7 @@ def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, Driven]:
 
 def agent_trajectories(count: int, processes: int) -> Driven:
     """Trajectories of AGENT, on tracks kept for inspection: a third of `count`."""
-    tracks = track_seeds("inspect", max(FEWEST, count // 3), 2)
+    tracks = track_seeds("inspect", max(FEWEST_TRAJECTORIES, count // 3), 2)
     tasks = [(load_agent(AGENT), track, AGENT_FRAMES) for track in tracks]
     with worker_threads(processes) as executor:
         return run_in_order(executor, record_trajectory, tasks, "trained agent"), AGENT_SKIP
@@ -118,8 +120,9 @@ def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> di
     ValueError for too few trajectories, or V and M that do not belong together, and
     FileNotFoundError if they are not there.
     """
-    if count < FEWEST:
-        raise ValueError(f"episodes={count}: expected at least {FEWEST}, to fit and measure on")
+    if count < FEWEST_TRAJECTORIES:
+        expected = f"expected at least {FEWEST_TRAJECTORIES}, to fit and measure on"
+        raise ValueError(f"episodes={count}: {expected}")
     model = load_world_model(run_folder(source))
     drivers = two_drivers(random_trajectories(count, PROBE_SEED, processes), processes)
     encoder = encoder_of(model, {"z, h": model.mdn_rnn})

@@ -28,12 +28,10 @@ from stad_lab.training import evolution
 from stad_lab.training.dataset import MANIFEST, Dataset, check_seen, count_episodes
 from stad_lab.training.mdn_rnn import check_mdn_rnn
 from stad_lab.training.record import (
-    GIVE_A_RUN,
     MACHINE,
     PACKAGES,
-    RECORD,
-    check_record,
     provenance,
+    read_record,
     starts,
 )
 from stad_lab.training.subspace import search_space
@@ -61,8 +59,7 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
         FileNotFoundError, ValueError: no record in the folder, or a damaged one.
     """
     folder = Path(folder)
-    check_record(folder)
-    record = load_json(folder / RECORD, GIVE_A_RUN, kind="record")
+    record = read_record(folder)
     config = Config.from_dict(record["config"])
     dataset, vae = folder / "dataset", folder / VAE_FILE
     models, log = (VAE_FILE, MDN_RNN_FILE), evolution.LOG

@@ -9,7 +9,6 @@ All of it runs on one thread: the last bits of an eigendecomposition depend on h
 import dataclasses
 import math
 import zlib
-from collections.abc import Callable
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -26,6 +25,7 @@ from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_world_model
 from stad_lab.io.workers import run_in_order, single_thread, worker_threads
 from stad_lab.models.controller import unpack
 from stad_lab.training.subspace import SearchSpace, search_space
+from stad_lab.training.trainer import Watch
 
 if TYPE_CHECKING:
     from cma import CMAEvolutionStrategy as Strategy
@@ -34,10 +34,8 @@ LOG = "evolution.json"
 # A hard track may be replayed from the last so many generations, without the very last ones.
 REMEMBERED, RESTING = 20, 4
 
-Watch = Callable[[list[dict]], None]
 
-
-class Drives(Protocol):
+class DrivingModel(Protocol):
     """What drives in place of a world model, for example with another view of z."""
 
     sizes: tuple[int, int]  # how many numbers z has, and how many C sees beside it
@@ -53,7 +51,7 @@ class Evolution:
 
     config: Config
     folder: Path
-    world_model: WorldModel | Drives
+    world_model: WorldModel | DrivingModel
     space: SearchSpace
     log: dict
     strategy: "Strategy"
@@ -66,7 +64,7 @@ class Evolution:
 
 def evolve(
     config: Config, folder: Path, executor: Executor | None = None, watch: Watch | None = None,
-    drives: Drives | None = None,
+    drives: DrivingModel | None = None,
 ) -> bool:  # fmt: skip
     """Evolve C for the V and M in `folder`; False if the run was complete already.
 
@@ -127,7 +125,7 @@ def run_generation(run: Evolution, executor: Executor, source: Any) -> None:
         keep_controller(run, run.controller())
 
 
-def read_log(config: Config, folder: Path, world_model: WorldModel | Drives) -> dict:
+def read_log(config: Config, folder: Path, world_model: WorldModel | DrivingModel) -> dict:
     """The log of the run in `folder`, or a new one; ValueError if it is damaged or does not fit."""
     path, settings = folder / LOG, dataclasses.asdict(config.evolution)
     made_with = {"variant": config.variant, "seed": config.seed, "evolution": settings}
@@ -352,7 +350,7 @@ def drive_parallel(
 
 
 def drive_group(
-    source: Path | WorldModel | Drives,
+    source: Path | WorldModel | DrivingModel,
     parameters: np.ndarray,
     tracks: list[int],
     fast: bool = True,

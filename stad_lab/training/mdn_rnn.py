@@ -16,7 +16,7 @@ from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_vae
 from stad_lab.models.mdn_rnn import MDNRNN, mdn_loss
 from stad_lab.models.vae import VAE
 from stad_lab.training.dataset import Dataset
-from stad_lab.training.trainer import Training, fit, torch_settings
+from stad_lab.training.trainer import Training, Watch, fit, torch_settings
 from stad_lab.training.vae import check_vae
 
 CHECKPOINT = "mdn_rnn.training.safetensors"
@@ -37,7 +37,7 @@ def train_mdn_rnn(
     config: Config,
     dataset: Callable[[], Dataset],
     folder: Path,
-    watch: Callable[[list[dict]], None] | None = None,
+    watch: Watch | None = None,
 ) -> bool:
     """Train M on the dataset as V, in `folder`, encodes it; False if M was there already.
 
@@ -83,7 +83,7 @@ def fit_mdn_rnn(
     latents: Latents,
     path: Path,
     device: torch.device,
-    watch: Callable[[list[dict]], None] | None = None,
+    watch: Watch | None = None,
 ) -> None:
     """Train an M on encoded episodes and write it to `path`."""
     mdn_rnn = MDNRNN.of(config).to(device)

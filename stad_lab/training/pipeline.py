@@ -57,7 +57,7 @@ RUN_FILES = (*WEIGHTS, LOG, RECORD, MANIFEST)
 
 Stage = Callable[[Executor], bool]
 """Does what is missing; returns False if nothing was."""
-Watch = Callable[[str, list[dict]], None]
+StageWatch = Callable[[str, list[dict]], None]
 """Called with a stage's name and its history, or the generations of CMA-ES."""
 
 
@@ -68,7 +68,7 @@ def train(
     until: str = "controller",
     executor: Executor | None = None,
     earlier: str | Path | None = None,
-    watch: Watch | None = None,
+    watch: StageWatch | None = None,
 ) -> bool:
     """Run every stage up to `until` that is not finished in `folder`; False if all were.
 
@@ -110,7 +110,7 @@ def train(
 
 
 def make_stages(
-    config: Config, folder: Path, data: Path, earlier: Path | None, watch: Watch | None = None
+    config: Config, folder: Path, data: Path, earlier: Path | None, watch: StageWatch | None = None
 ) -> dict[str, Stage]:
     """The four stages as functions of the executor that drives."""
     watched = {name: watch and functools.partial(watch, name) for name in STAGES[1:]}
@@ -178,7 +178,7 @@ def run_stages(
                 try:
                     with worker_threads(config.processes, executor) as pool:
                         did = stage(pool)
-                except (ValueError, OSError):  # refused, so the record stays as it was
+                except (ValueError, OSError):  # refused: what it noted so far stays
                     raise
                 except BaseException:  # an interrupted stage has worked, too
                     note()

@@ -44,13 +44,18 @@ def check_record(folder: Path) -> None:
         raise ValueError(f"{path} is of {record.get('variant')!r}, no run: choose another folder")
 
 
+def read_record(folder: Path) -> dict:
+    """The record of a run; ValueError if it is damaged, FileNotFoundError if there is none."""
+    check_record(folder)
+    return load_json(folder / RECORD, GIVE_A_RUN, kind="record")
+
+
 def read_finished(earlier: Path) -> dict:
     """The record of a run whose CMA-ES has finished.
 
     ValueError if it has not, or a file is damaged; FileNotFoundError if there is no run, or no log.
     """
-    check_record(earlier)
-    record = load_json(earlier / RECORD, GIVE_A_RUN, kind="record")
+    record = read_record(earlier)
     log = load_json(earlier / LOG, GIVE_A_RUN, kind="evolution")
     done, asked = len(log["generations"]), log["evolution"]["generations"]
     if done != asked:

@@ -30,6 +30,9 @@ ENTRIES = 20  # of the history, and checkpoints, in a training
 LARGEST_NORM = 100.0  # of the gradient, which is shortened to it
 LAST_RATE = 0.1  # learning rate at the end, as a share of that at the start
 
+Watch = Callable[[list[dict]], None]
+"""Called with a history after every entry, and when a training is resumed."""
+
 
 @dataclass
 class Training:
@@ -44,8 +47,7 @@ class Training:
     checkpoint: Path
     made_with: dict  # configuration and checksums of all that the training depends on
     label: str  # of the progress bar
-    # Called with the history after every entry, and when a training is resumed.
-    watch: Callable[[list[dict]], None] | None = None
+    watch: Watch | None = None
 
 
 def fit(training: Training) -> list[dict]:

@@ -13,7 +13,7 @@ from stad_lab.io.files import locked
 from stad_lab.io.weights import VAE_FILE, load_vae, save_vae
 from stad_lab.models.vae import VAE, to_tensor, vae_losses
 from stad_lab.training.dataset import Dataset
-from stad_lab.training.trainer import Training, fit, torch_settings
+from stad_lab.training.trainer import Training, Watch, fit, torch_settings
 
 CHECKPOINT = "vae.training.safetensors"
 HELDOUT_FRAMES, HELDOUT_BATCHES = 1000, 8  # on which the loss is measured
@@ -23,7 +23,7 @@ def train_vae(
     config: Config,
     dataset: Callable[[], Dataset],
     folder: Path,
-    watch: Callable[[list[dict]], None] | None = None,
+    watch: Watch | None = None,
 ) -> bool:
     """Train V into `folder`, or continue an interrupted training; False if V was there already.
 

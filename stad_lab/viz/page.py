@@ -31,7 +31,8 @@ def document(title: str, body: str, style: str = "") -> str:
 <h1>{html.escape(title)}</h1>{body}</main></html>"""
 
 
-def picture(content: bytes, kind: str, alt: str) -> str:
-    """An <img> that holds its file; `kind` is "png", "gif" or "webp"."""
+def picture(content: bytes, kind: str, alt: str, style: str = "") -> str:
+    """An <img> that holds its file; `kind` is "png", "gif" or "webp", `style` is CSS."""
     source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-    return f'<img loading=lazy alt="{html.escape(alt)}" src="{source}">'
+    styled = f' style="{style}"' if style else ""
+    return f'<img loading=lazy alt="{html.escape(alt)}"{styled} src="{source}">'

@@ -46,7 +46,7 @@ def describe(figure: Figure, title: str, lead: str, values: Iterable[str] = ()) 
     return figure
 
 
-def show_picture(axis: Axes, picture: np.ndarray, **scale) -> AxesImage:
+def draw_picture(axis: Axes, picture: np.ndarray, **scale) -> AxesImage:
     """A picture in an axis without ticks and border; returns what a colour bar needs."""
     axis.set(xticks=[], yticks=[])
     axis.spines[:].set_visible(False)
@@ -92,7 +92,6 @@ def plot_pictures(
     columns: list[str],
     names: list[str],
     title: str,
-    scale_name: str = "difference d",
 ) -> Figure:
     """Pictures in a grid.
 
@@ -101,7 +100,6 @@ def plot_pictures(
             their mean over the colours on one scale; None leaves a gap.
         columns: titles of the columns.
         names: of the rows; "" for none.
-        scale_name: label of the difference images' scale.
     """
     size = 1.7 * len(columns) + 0.8, 1.75 * len(rows) + 0.75
     figure, axes = new_figure(*size, len(rows), len(columns))
@@ -112,16 +110,16 @@ def plot_pictures(
     for row, name, row_axes in zip(rows, names, axes, strict=True):
         for picture, axis in zip(row, row_axes, strict=True):
             if picture is None:
-                show_picture(axis, np.full((1, 1, 4), 0))  # transparent
+                draw_picture(axis, np.full((1, 1, 4), 0))  # transparent
             elif picture.dtype == np.uint8:
-                show_picture(axis, picture)
+                draw_picture(axis, picture)
             else:
-                drawn = show_picture(axis, picture.mean(axis=-1), **scale)
+                drawn = draw_picture(axis, picture.mean(axis=-1), **scale)
         row_axes[0].set_ylabel(name, fontsize=9)
     for column, axis in zip(columns, axes[0], strict=True):
         caption(axis, column)
     if drawn is not None:
-        figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label=scale_name)
+        figure.colorbar(drawn, ax=axes, shrink=0.8, aspect=30, label="difference d")
     lead = f"Rows: {', '.join(filter(None, names)) or 'one'}; columns: "
     return describe(figure, title, lead, columns)
 

@@ -13,7 +13,7 @@ from stad_lab.evaluation.statistics import SOLVED, describe_tail
 from stad_lab.io.files import load_json
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_mdn_rnn, load_vae
 from stad_lab.training.evolution import LOG, fitness_curves
-from stad_lab.training.record import GIVE_A_RUN, MACHINE, PACKAGES, RECORD, starts
+from stad_lab.training.record import MACHINE, PACKAGES, read_record, starts
 from stad_lab.viz import plots
 from stad_lab.viz.page import document, picture
 from stad_lab.viz.video import FILM, film_agent
@@ -29,7 +29,7 @@ def report(folder: Path) -> str:
 
     ValueError if the folder holds no run, or a file is damaged; FileNotFoundError without a record.
     """
-    record = load_json(folder / RECORD, GIVE_A_RUN, kind="record")
+    record = read_record(folder)
     figures = curves_of(folder)
     parts = [scores(folder), film(folder)]
     parts += [picture_of(figure) for figure in figures]

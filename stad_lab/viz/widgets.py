@@ -1,7 +1,5 @@
 """Thin ipywidgets around figures: show them, and draw them again when a slider moves."""
 
-import base64
-import html
 import io
 from collections.abc import Callable
 
@@ -13,7 +11,8 @@ from matplotlib.figure import Figure
 
 from stad_lab.io.workers import interrupted_at_the_end
 from stad_lab.models.vae import VAE, to_array, to_uint8
-from stad_lab.training.evolution import Watch
+from stad_lab.training.trainer import Watch
+from stad_lab.viz import page
 from stad_lab.viz.plots import difference_colors, to_png
 from stad_lab.viz.video import enlarged
 
@@ -33,8 +32,7 @@ def show_picture(content: bytes, kind: str, alt: str) -> HTML:
     """A picture as HTML, which keeps its alternative text; ValueError if there is none."""
     if not alt.strip():
         raise ValueError(f"alt={alt!r}: expected a text; a figure has one after set_label")
-    source = f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-    return HTML(f'<img src="{source}" alt="{html.escape(alt)}" style="background: white">')
+    return HTML(page.picture(content, kind, alt, "background: white"))
 
 
 def explore(draw: Callable[..., Figure], **controls: ipywidgets.Widget) -> ipywidgets.VBox:
