@@ -68,7 +68,7 @@ stad.Race = class {
     const mdnRnn = new stad.MDNRNN(engine, networks.mdnRnn);
     const driver = () => new stad.Agent(this.vae, mdnRnn, networks.controller, networks.cropBar);
     [this.you, this.rival] = [0, 1].map(() => new stad.Racer(engine, driver()));
-    if (this.track) this.begin(this.phase === "race" ? "attract" : this.phase);
+    if (this.track) this.begin("attract"); // a pause or a result is the earlier rival's
   }
 
   setTrack(seed) {
