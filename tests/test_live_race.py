@@ -49,15 +49,33 @@ def test_a_gamepad_begins_a_race_but_holding_it_does_not_end_a_pause(opened):
     page.wait_for_function("stad.page.state.action[1] === 0")
 
 
-def test_keys_go_on_after_esc_and_leave_letters_to_a_text_field(opened):
-    page = opened("race", reduced_motion="reduce")
+def stays(page, wanted):
+    """Whether a phase lasts, long enough for the worker to answer."""
+    page.wait_for_timeout(100)
+    return page.get_attribute("#live", "data-phase") == wanted
+
+
+def test_esc_gives_the_arrow_keys_to_the_page_and_a_text_field_has_its_letters(opened):
+    page = opened("race", reduced_motion="reduce", viewport={"width": 1000, "height": 500})
+    page.keyboard.press("ArrowDown")  # to brake before a race is no wish to race
+    assert stays(page, "attract") and page.evaluate("scrollY") > 0
     page.keyboard.press("ArrowUp")
     phase(page, "race")
-    for key in ("p", "ArrowLeft"):
-        page.keyboard.press("Escape")
-        phase(page, "paused")
-        page.keyboard.press(key)
-        phase(page, "race")
+    page.evaluate("scrollTo(0, 0)")
+    page.keyboard.press("Escape")
+    phase(page, "paused")
+    assert "Click the picture" in page.inner_text("#card")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowUp")
+    page.keyboard.press("ArrowDown")
+    assert stays(page, "paused") and page.evaluate("scrollY") > 0
+    page.keyboard.press("p")
+    phase(page, "race")
+    page.keyboard.press("Escape")
+    phase(page, "paused")
+    page.focus("#seat")
+    page.keyboard.press("ArrowLeft")
+    phase(page, "race")
     page.focus("#auto")
     page.keyboard.press("p")  # this disables the button, which takes no keys then
     phase(page, "paused")
@@ -69,6 +87,39 @@ def test_keys_go_on_after_esc_and_leave_letters_to_a_text_field(opened):
     page.keyboard.type("wasd dream p")
     assert page.input_value("#search") == "wasd dream p"
     assert page.get_attribute("#live", "data-phase") == "race" and page.is_hidden("#dream")
+
+
+def test_out_of_sight_no_key_begins_a_race_and_the_demonstration_stands_still(opened):
+    page = opened("race")
+    frames = "stad.page.state.rival.frames"
+    page.click("#pause")
+    assert page.inner_text("#pause") == "Play"
+    page.wait_for_timeout(100)
+    begun = page.evaluate(frames)
+    assert stays(page, "attract") and page.evaluate(frames) == begun
+    page.keyboard.press("p")
+    page.wait_for_function(f"{frames} > {begun}")
+    page.evaluate("live.insertAdjacentHTML('afterend', '<p style=height:200vh>')")
+    page.evaluate("scrollTo(0, 1e6)")
+    page.wait_for_timeout(200)
+    begun = page.evaluate(frames)
+    page.keyboard.press("ArrowUp")  # the button of the race has the focus
+    assert stays(page, "attract") and page.evaluate(frames) == begun
+
+
+def test_another_rival_in_a_pause_ends_the_race_and_its_dream(opened):
+    page = opened("race", reduced_motion="reduce")
+    page.keyboard.down("ArrowUp")
+    phase(page, "race")
+    page.wait_for_function("stad.page.state.you.frames > 10")
+    page.click("#auto")
+    page.focus("#seat")
+    page.keyboard.press("e")
+    page.keyboard.press("p")
+    phase(page, "paused")
+    page.select_option("#agent", "input")
+    phase(page, "attract")
+    assert page.is_hidden("#dream") and page.get_attribute("#auto", "aria-pressed") == "false"
 
 
 def test_the_easy_way_gives_no_gas_above_60_until_it_is_switched_off(opened):
@@ -124,6 +175,12 @@ def test_a_finger_steers_with_gas_by_itself(opened):
     slide = down | {"clientX": box["x"] + box["width"] - 20}
     page.evaluate("(on) => race.dispatchEvent(new PointerEvent('pointermove', on))", slide)
     page.wait_for_function("stad.page.state.action[0] > 0.5")
+    page.click("#eyes")  # the dream and the scores lie over the canvas
+    page.wait_for_selector("#dream:not([hidden])")
+    top = "([x, y]) => document.elementFromPoint(x, y).id"
+    middle = [box["x"] + box["width"] / 2, box["y"] + box["height"] / 2]
+    for point in (middle, [box["x"] + 20, box["y"] + 20]):
+        assert page.evaluate(top, point) == "race"
 
 
 def test_a_lap_with_the_autopilot_is_no_record_of_the_reader(opened):

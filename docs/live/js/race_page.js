@@ -14,6 +14,8 @@ stad.start(async () => {
   let [track, state, before, arrived] = [null, null, null, 0];
   let [best, asleep, sleptAt] = [readBest(), false, null];
   let seen = true; // whether enough of the picture is in the window
+  let still = stad.prefersStill(); // whether the demonstration before a race stands still
+  let left = false; // after Esc the arrow keys are the page's, until the reader comes back
   let { seed, agent, driver } = readAddress();
   const held = new Map();
   const worker = await startWorker();
@@ -314,7 +316,7 @@ stad.start(async () => {
     const driven = Math.round(100 * you.tiles);
     const name = driver ? "evolved driver" : `agent ${agent}`;
     const text = {
-      attract: `The ${name} drives on track ${seed}. Press an arrow key to race it.`,
+      attract: `The ${name} drives on track ${seed}. Press the up arrow to race it.`,
       race: `You race on track ${seed}: ${driven}% of the lap, ${mine} points.`,
       paused: `Paused at ${driven}% of the lap.`,
       over: `The race is over: you ${mine}, the agent ${rival.score.toFixed(0)} points.`,
@@ -327,20 +329,26 @@ stad.start(async () => {
     get("live").dataset.phase = phase;
     get("card").hidden = phase === "race";
     [get("again").hidden, get("share").hidden] = [phase === "attract", phase === "attract"];
-    set("pause", phase === "paused" ? "Go on" : "Pause");
-    get("pause").disabled = phase !== "race" && phase !== "paused";
+    showPause();
+    get("pause").disabled = phase === "over";
     get("eyes").disabled = get("auto").disabled = phase !== "race";
     // A disabled button would keep the keys from the page.
     if (document.activeElement.disabled) get("seat").focus({ preventScroll: true });
     if (phase !== "race" && phase !== "paused") wake();
     if (phase === "over") [endedAt, touched] = [performance.now(), false];
-    if (phase === "over") setAuto(false);
+    if (phase === "over" || phase === "attract") setAuto(false);
     set("share", "Copy the link");
+    showWay();
     if (phase === "attract") showStart();
-    const way = touching ? "Touch the picture" : "Press P or an arrow key";
-    if (phase === "paused") showCard("Paused", `${way} to go on.`);
+    if (phase === "paused") showCard("Paused", "");
     if (phase === "over") showEnd();
     if (phase === "race" && was === "attract") stad.announce("The race has begun.");
+  }
+
+  function showPause() {
+    const { phase } = state;
+    const stands = phase === "attract" && still;
+    set("pause", phase === "paused" ? "Go on" : stands ? "Play" : "Pause");
   }
 
   function showCard(title, text) {
@@ -348,9 +356,21 @@ stad.start(async () => {
     set("card-text", text);
   }
 
+  /** How the reader begins or goes on, now: the last sentence of the card. */
+  function showWay() {
+    const keys = {
+      attract: ["Press the up arrow or touch the picture", "to race it"],
+      paused: ["Press P or an arrow key", "to go on"],
+      over: ["Press the up arrow", "to race again"],
+    }[state.phase];
+    if (!keys) return set("card-way", "");
+    const way = touching ? "Touch the picture" : left ? "Click the picture" : keys[0];
+    set("card-way", `${way} ${keys[1]}.`);
+  }
+
   function showStart() {
     const title = `Beat the ${driver ? "evolved driver" : "agent"}`;
-    showCard(title, "You have 20 seconds. Press an arrow key, or touch the picture.");
+    showCard(title, "You have 20 seconds.");
   }
 
   function showEnd() {
@@ -361,10 +381,9 @@ stad.start(async () => {
     const ways = ["The time is up", "A whole lap", "You left the map"];
     const text =
       `${ways[you.ending]} after ${seconds(you.frames)} s: ${mine.toFixed(1)} points. ` +
-      `Your rival has ${its.toFixed(1)}. ${recordOf(mine, helped)} ` +
-      `${touching ? "Touch the picture" : "Press an arrow key"} to race again.`;
+      `Your rival has ${its.toFixed(1)}. ${recordOf(mine, helped)}`;
     showCard(title, text);
-    stad.announce(`${title} ${text}`);
+    stad.announce(`${title} ${text} ${get("card-way").textContent}`);
   }
 
   /** The reader's best on this track; a lap with the autopilot is none. */
@@ -418,6 +437,7 @@ stad.start(async () => {
   }
 
   function begin() {
+    left = false;
     wake();
     setAuto(false);
     worker.postMessage({ type: "begin", phase: "race" });
@@ -455,6 +475,28 @@ stad.start(async () => {
     worker.postMessage({ type: "pause", paused });
   }
 
+  /** P or its button. Before a race it stops the demonstration. */
+  function togglePause() {
+    if (state.phase === "paused") return wish();
+    if (state.phase !== "attract") return setPaused(true);
+    still = !still;
+    showPause();
+    rest();
+  }
+
+  /** Nothing moves that nobody sees, or wants to see. */
+  function rest() {
+    worker.postMessage({ type: "rest", on: !seen || document.hidden || still });
+  }
+
+  /** Esc: the keys are the page's again. */
+  function leave() {
+    left = true;
+    setPaused(true);
+    document.activeElement.blur();
+    showWay();
+  }
+
   function sendPedals() {
     const pads = stad.readGamepad();
     const down = [...held.values()];
@@ -464,7 +506,7 @@ stad.start(async () => {
 
   /** A driver has touched a pedal: begin, or go on. */
   function wish() {
-    if (!seen) get("race").scrollIntoView({ block: "center" });
+    left = false;
     if (state?.phase === "attract") begin();
     else if (state?.phase === "paused") setPaused(false);
     else if (state?.phase === "over" && performance.now() - endedAt > 1500) begin(); // not by chance
@@ -482,19 +524,21 @@ stad.start(async () => {
     const { target } = event;
     // What takes letters or arrow keys itself keeps them.
     if (target.isContentEditable || target.matches(TAKES_KEYS)) return;
-    if (event.key === "Escape") {
-      setPaused(true);
-      document.activeElement.blur();
-      return;
-    }
-    const racing = state.phase === "race" || get("seat").contains(document.activeElement);
+    const { phase } = state;
+    const inside = seen && get("seat").contains(document.activeElement);
+    const racing = inside || (phase === "race" && !left);
     const free = document.activeElement === document.body; // no other control wants the keys
     if (!racing && !(seen && free)) return;
-    if (event.key.toLowerCase() === "p" && !event.repeat)
-      return state.phase === "paused" ? wish() : setPaused(true);
+    if (event.key === "Escape") return leave();
+    if (event.key.toLowerCase() === "p" && !event.repeat) return togglePause();
     if (event.key.toLowerCase() === "e" && !event.repeat) return toggleEyes();
     const pedal = KEYS[event.code];
     if (!pedal || (event.code === "Space" && target.matches("button, input"))) return;
+    if (left && !racing) return;
+    // The down arrow and space move the page, unless there is a race to brake in. A key that is
+    // still down at the end of a race moves nothing.
+    const brakes = racing && (phase === "race" || phase === "paused");
+    if (pedal === "brake" && !brakes && !held.has(event.code)) return;
     event.preventDefault();
     if (event.repeat) return;
     held.set(event.code, pedal);
@@ -511,14 +555,16 @@ stad.start(async () => {
     sendPedals();
     setPaused(true);
   });
-  document.addEventListener("visibilitychange", () => document.hidden && setPaused(true));
+  document.addEventListener("visibilitychange", () => {
+    if (document.hidden) setPaused(true);
+    rest();
+  });
 
-  // Out of sight nothing drives, and who wants no motion sees a still picture until the race.
   new IntersectionObserver(
-    ([{ isIntersecting }]) => {
-      seen = isIntersecting;
+    (entries) => {
+      seen = entries.at(-1).isIntersecting; // the newest: several may have been waiting
       if (!seen) setPaused(true);
-      worker.postMessage({ type: "rest", on: !seen || stad.prefersStill() });
+      rest();
     },
     { threshold: 0.4 },
   ).observe(get("race"));
@@ -559,7 +605,7 @@ stad.start(async () => {
   setInterval(() => {
     const [was, now] = [gripped, stad.readGamepad() !== null];
     gripped = now;
-    if (now && !was) wish(); // not while it is held: the reader may have paused since
+    if (now && !was && seen) wish(); // not while it is held: the reader may have paused since
     if (now || was) sendPedals();
   }, 40);
 
@@ -578,7 +624,7 @@ stad.start(async () => {
     drive(Math.floor(Math.random() * 10000));
     writeAddress();
   });
-  get("pause").addEventListener("click", () => setPaused(state.phase === "race"));
+  get("pause").addEventListener("click", togglePause);
   get("eyes").addEventListener("click", toggleEyes);
   get("auto").addEventListener("click", () => setAuto(!autopilot()));
   get("agent").addEventListener("change", ({ target }) => {
