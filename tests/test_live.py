@@ -213,7 +213,13 @@ def test_the_reader_closes_the_eyes_drives_and_opens_them_with_the_keyboard_alon
     page.keyboard.down("ArrowUp")
     assert page.locator("button[data-pedal=gas].held").count() == 1
     page.keyboard.up("ArrowUp")
-    page.keyboard.press("Escape")
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("Escape")  # gives the keys back, and the dream waits
+    page.evaluate("scrollTo(0, 0)")
+    page.keyboard.press("ArrowDown")
+    page.wait_for_function("scrollY > 0 && !stad.page.clock.running")
+    page.keyboard.press("p")
+    assert page.evaluate("stad.page.clock.running")
 
 
 def test_impatient_clicks_break_nothing(opened):

@@ -275,13 +275,22 @@ stad.start(async () => {
     if (detail > 0 && target.value === "hand") sit();
   });
   get("seat").addEventListener("keydown", (event) => {
-    if (event.key === "Escape") document.activeElement.blur(); // arrow keys move the page again
     if (event.target.matches("button") || event.ctrlKey || event.altKey || event.metaKey) return;
     if (event.key !== " " && event.key.toLowerCase() !== "e") return;
     event.preventDefault();
     if (event.repeat) return;
     if (event.key === " ") togglePlay();
     else toggleEyes(event);
+  });
+  // Esc gives the arrow keys back to the page, wherever the focus is while they steer.
+  document.addEventListener("keydown", (event) => {
+    if (event.repeat || event.ctrlKey || event.altKey || event.metaKey) return;
+    const sits = get("seat").contains(document.activeElement);
+    const free = document.activeElement === document.body;
+    if (event.key.toLowerCase() === "p" && (sits || free)) return togglePlay(event);
+    if (event.key !== "Escape" || !(drives() || sits)) return;
+    document.activeElement.blur();
+    if (dream && driver === "hand") setPlaying(false);
   });
   const take = touched(() => {
     if (driver !== "hand" || !dream) setDriver("hand");
