@@ -269,5 +269,41 @@ def test_the_button_of_the_dreams_says_what_it_does(opened):
     assert page.evaluate("drives") == 1  # there is one car
     page.evaluate(SHORT_DREAMS)
     play.get_by_text("Again").wait_for()
+    assert "of the three" in figure.locator("[data-part=answer]").inner_text()  # the bet is settled
     play.click()
     page.wait_for_function("drives === 2")
+
+
+MOVES_THE_PAGE = """() => {
+    const key = { code: "ArrowDown", key: "ArrowDown", bubbles: true, cancelable: true }
+    return document.body.dispatchEvent(new KeyboardEvent("keydown", key))
+}"""
+
+
+def test_the_reader_of_the_story_drives_as_long_as_c_and_gets_the_arrow_keys_back(opened):
+    page = opened("story")
+    figure = page.locator("[data-figure=wheel]")
+    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
+    page.wait_for_selector("[data-figure=wheel][data-state=ready]")
+    answer, seconds = (figure.locator(f"[data-part={name}]") for name in ("answer", "seconds"))
+    in_seat = "document.activeElement.closest('[data-part=seat]') !== null"
+    figure.locator("[data-part=you]").click()
+    seconds.get_by_text("Take over in 2").wait_for()
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("Escape")
+    assert "stopped after" in answer.inner_text()
+    assert page.evaluate(MOVES_THE_PAGE)
+    figure.locator("[data-part=you]").click()
+    assert not page.evaluate(MOVES_THE_PAGE)
+    assert page.evaluate(in_seat)
+    page.evaluate("scrollTo(0, 0)")
+    page.wait_for_function(f"!({in_seat})")
+    assert page.evaluate(MOVES_THE_PAGE)
+    page.evaluate("stad.Dream.prototype.step = function () { this.frames += 25 }")  # stays on it
+    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
+    for name in ("you", "agent"):
+        figure.locator(f"[data-part={name}]").click()
+        answer.get_by_text("to the end").wait_for()
+        assert seconds.inner_text() == "20.0 s"
+        figure.locator("[data-part=seat]").press("ArrowUp")  # not so soon
+        assert "to the end" in answer.inner_text()

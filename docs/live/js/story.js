@@ -17,8 +17,8 @@ globalThis.stad ??= {};
     const root = document.querySelector(`[data-figure=${name}]`);
     if (!root) return;
     const part = (id) => root.querySelector(`[data-part=${id}]`);
-    const near = new IntersectionObserver(async ([seen]) => {
-      if (!seen.isIntersecting) return;
+    const near = new IntersectionObserver(async (entries) => {
+      if (!entries.at(-1).isIntersecting) return; // the newest: several may have been waiting
       near.disconnect();
       try {
         figures.set(root, (await make(part)) ?? {});

@@ -59,11 +59,9 @@
       driving = true;
       await approach();
       driving = false;
-      dreams = canvases.map(() => ({ dream: dreamOf(seed++), apart: 0, parted: null }));
+      dreams = canvases.map(() => ({ dream: dreamOf(seed++), apart: null, parted: null }));
       for (const { dream } of dreams) dream.temperature = Number(part("temperature").value);
       over = false;
-      agent.remember(agent.control());
-      car.step(agent.control());
       draw();
     }
 
@@ -76,9 +74,17 @@
       showPlay();
     }
 
+    /** One frame of the real car, from a picture that the agent has seen to the next one. */
+    function drive() {
+      const action = agent.control();
+      agent.remember(action);
+      car.step(action);
+      agent.see(car.frame());
+    }
+
     function step() {
       for (const { dream } of dreams) dream.step(act(dream));
-      if (!car.over) car.step(agent.act(car.frame()));
+      if (!car.over) drive();
       if (dreams[0].dream.frames >= LONGEST || car.over) {
         over = true;
         clock.pause();
@@ -92,9 +98,11 @@
       dreams.forEach((one, i) => {
         const { frame } = vae.decode(one.dream.z);
         stad.paintFrame(canvases[i], frame);
-        if (one.dream.frames === 0 || one.parted !== null) return;
-        one.apart = disagreement(frame, real) > SAME ? one.apart + 1 : 0;
-        if (one.apart >= LASTING) one.parted = Math.max(1, one.dream.frames - LASTING);
+        const now = one.dream.frames;
+        if (now === 0 || one.parted !== null) return;
+        if (disagreement(frame, real) <= SAME) one.apart = null;
+        else one.apart ??= now; // a slow device draws fewer frames than it dreams
+        if (one.apart !== null && now - one.apart >= LASTING - 1) one.parted = one.apart;
       });
       const told = dreams.map(({ parted }) => (parted === null ? "still together" : `parted after ${inSeconds(parted)} s`)); // prettier-ignore
       told.forEach((text, i) => {
@@ -104,14 +112,19 @@
       part("time").textContent = `${time} s with closed eyes`;
       stad.describe(part("real"), `the real road, ${time} seconds after the eyes closed`);
       canvases.forEach((canvas, i) => stad.describe(canvas, `dream ${i + 1}, ${told[i]}`));
-      if (bet && dreams.every(({ parted }) => parted !== null)) settle();
+      const known = dreams.filter(({ parted }) => parted !== null).length > 1;
+      if (bet && (known || over)) settle();
     }
 
-    /** The bet is on the middle one of three dreams. */
+    /** The bet is on the middle one of three dreams, so it is known when two have parted. */
     function settle() {
-      const middle = dreams.map(({ parted }) => parted).sort((a, b) => a - b)[1];
+      const middle = dreams.map(({ parted }) => parted ?? Infinity).sort((a, b) => a - b)[1];
       const answer = BOUNDS.filter((bound) => middle > bound).length;
-      const text = `${bet.choice === answer ? "Right" : "No"}: the middle one of the three parted after ${inSeconds(middle)} seconds.`;
+      const told =
+        middle < Infinity
+          ? `the middle one of the three parted after ${inSeconds(middle)} seconds.`
+          : `two of the three were still together after ${inSeconds(dreams[0].dream.frames)} seconds, when they ended.`; // prettier-ignore
+      const text = `${bet.choice === answer ? "Right" : "No"}: ${told}`;
       part("answer").textContent = text;
       stad.announce(text);
       bet = null;
@@ -127,6 +140,7 @@
           if (!part("after").hidden) return; // the first bet counts
           bet = { choice };
           button.setAttribute("aria-pressed", "true");
+          for (const one of box.children) one.setAttribute("aria-disabled", "true");
           part("after").hidden = false;
           again();
         });
@@ -163,16 +177,18 @@
   stad.figure("wheel", async (part) => {
     const { vae, approach, dreamOf, act } = await loadInstant();
     const LOST = 25; // frames in a row without a road under the car
-    const TAKE_OVER = 75; // frames that the hand drives for the reader at first
+    const TAKE_OVER = 75; // frames that C drives for the reader at first
+    const REST = 1500; // milliseconds after the end in which no key begins again
     const hand = new stad.Hand();
     const best = { you: 0, agent: 0 };
-    let [dream, who, off, over, seed] = [null, null, 0, true, 1];
+    let [dream, who, over, endedAt, seed] = [null, null, true, -Infinity, 1];
+    let [off, seen] = [0, 0]; // frames off the road, up to the frame that was drawn last
     const clock = new stad.Clock(step, draw, 30); // slower than the car, so that one can react
     await approach();
     const own = () => who === "you" && dream.frames >= TAKE_OVER;
 
     function begin(driver) {
-      [dream, who, off, over] = [dreamOf(seed++), driver, 0, false];
+      [dream, who, over, off, seen] = [dreamOf(seed++), driver, false, 0, 0];
       hand.action.fill(0);
       part("answer").textContent = "";
       for (const name of ["you", "agent"]) part(name).setAttribute("aria-pressed", name === who);
@@ -184,14 +200,16 @@
       const action = own() ? hand.act() : act(dream);
       hand.action.set(action);
       dream.step(action);
-      if (dream.frames >= stad.LONGEST) finish();
+      const longest = stad.LONGEST + (who === "you" ? TAKE_OVER : 0); // as many for each
+      if (dream.frames >= longest) finish("stayed on it to the end.");
     }
 
     function draw() {
       const { frame } = vae.decode(dream.z);
       stad.paintFrame(part("view"), frame);
       if (over) return;
-      off = onRoad(frame) ? 0 : off + 1;
+      off = onRoad(frame) ? 0 : off + dream.frames - seen;
+      seen = dream.frames;
       if (who === "you" && !own()) {
         part("seconds").textContent =
           `Take over in ${Math.ceil((TAKE_OVER - dream.frames) / 30)} ...`;
@@ -199,7 +217,7 @@
         return;
       }
       part("seconds").textContent = `${lasted()} s`;
-      if (off >= LOST) finish();
+      if (off >= LOST) finish(`left the dreamed road after ${lasted()} seconds.`);
     }
 
     /** Seconds on the road, at the car's own pace. */
@@ -215,26 +233,28 @@
       return count > 144 / 3;
     }
 
-    function finish() {
-      over = true;
+    function finish(text) {
+      [over, endedAt] = [true, performance.now()];
       clock.pause();
       best[who] = Math.max(best[who], Number(lasted()));
       part("seconds").textContent = `${lasted()} s`;
       part(`best-${who}`).textContent = `${best[who].toFixed(1)} s`;
       const name = who === "you" ? "You" : "The hand (C)";
-      const text = off >= LOST ? `left the dreamed road after ${lasted()} seconds.` : "stayed on it to the end."; // prettier-ignore
       part("answer").textContent = `${name} ${text}`;
       stad.announce(`${name} ${text}`);
     }
 
     part("you").addEventListener("click", () => begin("you"));
     part("agent").addEventListener("click", () => begin("agent"));
-    const driving = () => !over && who === "you";
-    stad.listenToPedals(hand, part("seat"), () => over && begin("you"), driving);
-    part("seat").addEventListener("keydown", ({ key }) => {
-      if (key !== "Escape") return;
+    const driving = () => clock.running && who === "you";
+    const sits = () => part("seat").contains(document.activeElement);
+    const take = () => over && performance.now() - endedAt > REST && begin("you"); // not by chance
+    stad.listenToPedals(hand, part("seat"), take, driving);
+    // Esc, or to scroll on, gives the arrow keys back to the page.
+    document.addEventListener("keydown", ({ key }) => {
+      if (key !== "Escape" || !(driving() || sits())) return;
       document.activeElement.blur();
-      if (!over) finish();
+      if (!over) finish(`stopped after ${lasted()} seconds.`);
     });
     dream = dreamOf(seed);
     draw();
@@ -242,6 +262,7 @@
       run(on) {
         if (on && !over) clock.play();
         else clock.pause();
+        if (!on && sits()) document.activeElement.blur();
       },
     };
   });
