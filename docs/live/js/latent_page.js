@@ -88,6 +88,7 @@ stad.start(async () => {
     const [name, range, value] = ["span", "input", "output"].map((tag) =>
       document.createElement(tag),
     );
+    value.setAttribute("aria-live", "off"); // it changes while the first latent moves by itself
     const meaning = Math.abs(r) >= 0.5 ? `, ${quantity} (r = ${r.toFixed(2)})` : "";
     name.innerHTML = `<b>z[${i}]</b> ${kl(i).toFixed(2)} nats${meaning}`;
     Object.assign(range, { type: "range", min: -REACH, max: REACH, step: 0.05 });

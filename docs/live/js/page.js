@@ -18,8 +18,7 @@ stad.get = (id) => document.getElementById(id);
     try {
       await main();
       controls.disabled = controls.inert = false;
-      stad.get("message").hidden = true;
-      stad.get("live").dataset.state = "ready";
+      stad.recover();
     } catch (error) {
       stad.fail(error);
     }
@@ -27,6 +26,8 @@ stad.get = (id) => document.getElementById(id);
 
   /** Put all of the page into a fieldset, which takes no input yet. */
   function enclose() {
+    stad.forget(stad.get("live"));
+    stad.quieten(stad.get("live"));
     const fieldset = document.createElement("fieldset");
     fieldset.setAttribute("role", "presentation");
     fieldset.disabled = fieldset.inert = true;
@@ -35,6 +36,12 @@ stad.get = (id) => document.getElementById(id);
     stad.get("live").append(fieldset);
     return fieldset;
   }
+
+  /** All parts work, maybe again. */
+  stad.recover = () => {
+    stad.get("message").hidden = true;
+    stad.get("live").dataset.state = "ready";
+  };
 
   /** Show an error as a sentence. */
   stad.fail = (error) => {
@@ -76,6 +83,19 @@ stad.get = (id) => document.getElementById(id);
     describers.get(canvas)(text);
   };
 }
+
+/** Controls as the page has them: after a reload Firefox keeps values that no script knows. */
+stad.forget = (root) => {
+  for (const one of root.querySelectorAll("input"))
+    [one.value, one.checked] = [one.defaultValue, one.defaultChecked];
+  for (const one of root.querySelectorAll("select"))
+    one.selectedIndex = Math.max(0, [...one.options].findIndex((option) => option.defaultSelected));
+};
+
+/** An output is a live region by itself: one that changes 50 times a second must not be read. */
+stad.quieten = (root) => {
+  for (const one of root.querySelectorAll("output")) one.setAttribute("aria-live", "off");
+};
 
 /** Whether the reader has asked the system for less motion: then nothing moves by itself. */
 stad.prefersStill = () => matchMedia("(prefers-reduced-motion: reduce)").matches;

@@ -20,6 +20,8 @@ globalThis.stad ??= {};
     const near = new IntersectionObserver(async (entries) => {
       if (!entries.at(-1).isIntersecting) return; // the newest: several may have been waiting
       near.disconnect();
+      stad.forget(root);
+      stad.quieten(root);
       try {
         figures.set(root, (await make(part)) ?? {});
         root.querySelector("fieldset").disabled = false;
