@@ -10,12 +10,12 @@ stad.figure("study", async (part) => {
     const cleared = stad.clearCanvas(part("chart"));
     if (!cleared) return;
     const { context, width, height } = cleared;
-    const [ink, faint] = ["--color-foreground-primary", "--color-background-border"].map(
-      stad.color,
-    );
+    const ink = stad.color("--color-foreground-primary");
     const x = (points) => 8 + ((width - 16) * (points - LOW)) / (HIGH - LOW);
-    context.fillStyle = faint;
+    context.fillStyle = "rgba(128, 128, 128, 0.28)"; // seen in both themes
     context.fillRect(x(-margin), 0, x(margin) - x(-margin), height - 22);
+    for (const end of [-margin, margin])
+      stad.strokeLine(context, [[x(end), 0], [x(end), height - 22]], "#8a8a8a", 1); // prettier-ignore
     stad.strokeLine(context, [[x(0), 0], [x(0), height - 22]], ink, 1); // prettier-ignore
     if (shown) {
       context.setLineDash([5, 4]);
