@@ -197,7 +197,10 @@ stad.start(async () => {
       wrong ??
       (sure ? "" : `This ends your driver of generation ${log.length}. Download it first?`);
     ask(!wrong && !sure);
-    if (!wrong && sure) restart(stad.evolveSettings.fromControls()).catch(stad.fail);
+    get("restart").focus(); // Safari does not, and then no blur would take the question back
+    if (wrong || !sure) return;
+    if (log.length) bet = null; // it was on that evolution
+    restart(stad.evolveSettings.fromControls()).catch(stad.fail);
   });
   for (const name of stad.evolveSettings.NAMES)
     get(name).addEventListener("change", () => {

@@ -218,6 +218,7 @@
     begin((2 * (event.clientX - left)) / width - 1, 1 - (2 * (event.clientY - top)) / height);
   });
   plane.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.altKey || event.metaKey) return; // Alt+Left goes back
     const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     const move = moves[event.key];
     if (move) begin(start[0] + 0.05 * move[0], start[1] + 0.05 * move[1]);

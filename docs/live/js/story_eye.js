@@ -37,7 +37,7 @@ stad.figure("eye", async (part) => {
   const sliders = chosen.map((latent, i) => {
     const label = document.createElement("label");
     label.className = "wide";
-    label.innerHTML = `<span>${words[i]}: number ${latent} of 32</span><input type="range">`;
+    label.innerHTML = `<span>${words[i]}: <i>z</i>[${latent}]</span><input type="range">`;
     const range = label.querySelector("input");
     Object.assign(range, { min: -REACH, max: REACH, step: 0.05 });
     range.addEventListener("input", () => {
@@ -122,4 +122,5 @@ stad.figure("eye", async (part) => {
     },
     { once: true },
   );
+  if (part("price").open) part("price").dispatchEvent(new Event("toggle")); // opened meanwhile
 });

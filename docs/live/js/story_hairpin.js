@@ -89,7 +89,7 @@ stad.figure("hairpin", async (part) => {
   });
   part("map").addEventListener("keydown", (event) => {
     const way = { ArrowLeft: -5, ArrowRight: 5 }[event.key];
-    if (!way) return;
+    if (!way || event.ctrlKey || event.altKey || event.metaKey) return; // Alt+Left goes back
     event.preventDefault();
     put((mark ?? 0) + way);
     stad.announce(`The mark is at tile ${mark}.`);
