@@ -78,7 +78,7 @@ def study() -> dict[str, object]:
     """The primary comparisons of study 1, for the figure of the story."""
     comparisons = json.loads(CLAIMS.read_text(encoding="utf-8"))["study1"]["comparisons"]
     rows = []
-    for features, name in (("z, h", "the hand sees z and h"), ("z", "the hand sees z alone")):
+    for features, name in (("z, h", "the driver sees z and h"), ("z", "the driver sees z alone")):
         one = comparisons[f"{features}: input_output"]
         pairs = {"interval": one["interval"], "pairs": one["by_seed"]}
         rows.append({"name": name, "difference": one["difference"], **pairs})

@@ -45,6 +45,21 @@ stad.start(async () => {
     worker.postMessage({ type: "choose", networks });
   }
 
+  let missing = false; // whether the files of the last rival did not arrive
+
+  /** Let the chosen rival drive. */
+  async function change() {
+    try {
+      await choose(agent);
+      if (missing) stad.recover();
+      missing = false;
+      if (state?.phase === "attract") showStart(); // with the rival's name
+    } catch (error) {
+      missing = true;
+      stad.fail(error);
+    }
+  }
+
   function receive(message) {
     if (message.type === "error") return stad.fail(new Error(message.text.split("\n")[0]));
     if (message.type === "track") {
@@ -631,7 +646,7 @@ stad.start(async () => {
     const chosen = target.value === "evolved" ? evolved : { driver: null, agent: target.value };
     ({ driver, agent } = chosen);
     writeAddress();
-    choose(agent).catch(stad.fail);
+    change();
   });
   get("share").addEventListener("click", async () => {
     writeAddress();
@@ -640,7 +655,7 @@ stad.start(async () => {
       stad.announce("The link is copied.");
       set("share", "Copied");
     } catch {
-      set("share", location.href); // no clipboard: show it
+      set("share", "The link is in the address bar"); // there is no clipboard
     }
   });
   addEventListener("hashchange", () => {
@@ -651,7 +666,7 @@ stad.start(async () => {
     if (theirs !== ours || (driver && asked.agent !== agent)) return location.reload();
     if (asked.agent !== agent) {
       agent = get("agent").value = asked.agent;
-      choose(agent).catch(stad.fail);
+      change();
     }
     if (asked.seed !== seed) drive(asked.seed);
   });

@@ -25,7 +25,8 @@ stad.data ??= {};
           script.onload = () => done(stad.data[name]);
           script.onerror = () => {
             loading.delete(name); // another attempt may succeed
-            fail(new Error(`data/${name}.js is missing: build the site again`));
+            const cure = "Reload the page (or, in your own copy, build the site again).";
+            fail(new Error(`data/${name}.js did not arrive. ${cure}`));
           };
           document.head.append(script);
         }),

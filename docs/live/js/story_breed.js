@@ -68,6 +68,7 @@ stad.figure("breed", async (part) => {
     const text = `You said ${guess}: the first whole lap on this track is in generation ${generations[first]}.`;
     part("answer").textContent = text;
     part("plant").setAttribute("aria-disabled", "true");
+    part("play").disabled = false;
     stad.announce(text);
     moment = 0;
     if (wanted) clock.play();

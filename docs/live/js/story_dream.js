@@ -239,7 +239,7 @@
       best[who] = Math.max(best[who], Number(lasted()));
       part("seconds").textContent = `${lasted()} s`;
       part(`best-${who}`).textContent = `${best[who].toFixed(1)} s`;
-      const name = who === "you" ? "You" : "The hand (C)";
+      const name = who === "you" ? "You" : "The driver (C)";
       part("answer").textContent = `${name} ${text}`;
       stad.announce(`${name} ${text}`);
     }
