@@ -396,6 +396,14 @@ def test_a_film_can_be_paused_and_begins_still_for_who_wants_no_motion(site, bro
         page.close()
 
 
+# On a phone the theme lets an article's frame scroll, so that the article itself is never too wide.
+RIGHT_END = """() => {
+    const [frame, article] = [".content", "article"].map((one) => document.querySelector(one))
+    const hidden = frame ? frame.scrollWidth - frame.clientWidth : 0
+    return hidden > 1 ? Infinity : (article?.getBoundingClientRect().right ?? 0)
+}"""
+
+
 def test_no_page_is_wider_than_its_window(site, browser):
     page = browser.new_page()
     for file in kinds_of_pages(site[0])[0]:
@@ -403,8 +411,5 @@ def test_no_page_is_wider_than_its_window(site, browser):
         page.goto(file.as_uri())
         for width in (390, 1100, 1300):
             page.set_viewport_size({"width": width, "height": 900})
-            wide = page.evaluate(
-                "document.querySelector('article')?.getBoundingClientRect().right ?? 0"
-            )
-            assert wide <= width, file
+            assert page.evaluate(RIGHT_END) <= width, file
     page.close()
