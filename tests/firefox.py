@@ -37,6 +37,10 @@ class Firefox:
         """Open a page."""
         self.call("browsingContext.navigate", context=self.tab, url=address, wait="complete")
 
+    def reload(self):
+        """Open the page again, as its reader does: Firefox keeps what the controls say."""
+        self.call("browsingContext.reload", context=self.tab, wait="complete")
+
     def evaluate(self, function, argument=None):
         """The value of a function, or of the promise that it returns, in the page."""
         script = f"Promise.resolve(({function})({json.dumps(argument)})).then(JSON.stringify)"

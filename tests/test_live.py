@@ -298,6 +298,10 @@ def test_firefox_opens_every_page_and_dreams_as_python(firefox, live_pages, rng)
         assert firefox.evaluate(READY) == ["ready", []]
         if name != "dream":
             assert firefox.evaluate(PRESS_ALL) == ["ready", []]
+    firefox.evaluate("() => { scrub.value = 300 }")
+    firefox.reload()
+    assert firefox.evaluate(READY) == ["ready", []]
+    assert firefox.evaluate("() => Number(scrub.value)") < 300  # a value that no script knows
     compare_dream(firefox.evaluate, rng, 1.0, 50)
     state = "() => [stad.page.dream?.frames > 5, document.querySelector('#eyes').textContent]"
     firefox.evaluate(CLOSE_EYES)
