@@ -439,7 +439,9 @@ def faster_recipe(claims: dict) -> str:
         f"{found['difference']:+.1f} points, with a standard deviation of "
         f"{found['deviation']:.0f}, and its one-sided 95% bound {found['lower_bound']:+.1f}; from "
         f"the means of six seeds the bound is {found['lower_bound_of_seeds']:+.1f}. V was of "
-        "`frame` or `input_output`, and C saw z and h."
+        "`frame` or `input_output`, and C saw z and h. A run of `fast` took"
+        f" {found['minutes']['study6_fast']:.0f} minutes, one of `laptop`"
+        f" {found['minutes']['study6_laptop']:.0f} (medians; V and M trained on one core)."
     )
 
 

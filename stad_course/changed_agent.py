@@ -27,6 +27,6 @@ class ChangedAgent:
         """The changed actions of the present cars, float32 (cars, 3)."""
         before, actions = self.agent.state, self.agent.act_batch(seen).copy()
         velocity = self.cars.cars["velocity"][self.agent.cars, 0, :2]
-        actions = np.float32(self.change(actions, np.linalg.norm(velocity, axis=1)))
+        actions = self.change(actions, np.linalg.norm(velocity, axis=1)).astype(np.float32)
         self.agent.remember(actions, before)  # M is told what the car really does
         return actions

@@ -59,7 +59,7 @@ CARS = 16  # cars that drive in one batch: another number would change last bits
 THREADS = 1  # that train V and M, on every machine: last bits depend on their number
 WAIT = 120.0  # seconds to wait for another process that writes the tables
 COLLECTING = 3600.0  # seconds to wait for another process that collects the dataset
-STAGES = ("dataset", "vae", "mdn_rnn", "controller", "score")
+TIMED = ("dataset", "vae", "mdn_rnn", "controller", "score")
 MADE_WITH = ("commit", "processor", "threads", "torch", "trained_on")  # that is noted of V and M
 
 
@@ -422,7 +422,7 @@ def describe_progress(study: str, wanted: list[Pipeline], to: Path = tables.DATA
     if not missing or table.empty:
         return text
     own = table[table["study"] == study]
-    seconds = (own if len(own) else table)[[f"seconds.{stage}" for stage in STAGES]].mean()
+    seconds = (own if len(own) else table)[[f"seconds.{stage}" for stage in TIMED]].mean()
     trained = {(one.seed, one.variant) for one in done if one.study == study}
     worlds = {(one.seed, one.variant) for one in missing} - trained
     datasets = {seed for seed, _ in worlds} - {seed for seed, _ in trained}

@@ -9,6 +9,7 @@ import numpy as np
 import pandas
 
 from stad_lab.evaluation.statistics import mean_interval
+from stad_lab.training.pipeline import STAGES
 from stad_study import tables
 from stad_study.study import STUDIES, check_settings
 from stad_study.study_claims import MARGIN, describe_progress, returns_of_study
@@ -47,7 +48,14 @@ def describe_study6(folder: Path = tables.DATA) -> dict:
         "lower_bound": bound,
         "lower_bound_of_seeds": mean_interval(by_seed, outside=0.1)[0],
         "not_worse": bound > -MARGIN,
+        "minutes": {name: minutes_of(runs[runs["study"] == name]) for name in RECIPES},
     }
+
+
+def minutes_of(runs: pandas.DataFrame) -> float:
+    """The median of the minutes from an empty folder to C."""
+    stages = [f"seconds.{stage}" for stage in STAGES]
+    return float(runs[stages].sum(axis=1).median() / 60)
 
 
 def check_datasets(runs: pandas.DataFrame) -> None:

@@ -155,9 +155,9 @@ def add_speed(file: Path, to: Path = DATA) -> None:
     old = read("speed", to)
     save("speed", pandas.concat([old[~old.part.isin(parts)], pandas.DataFrame(lines)]), to)
     old = read("provenance", to)
-    same = (old.table == "speed") & (old.source == "benchmark")
-    line = {"table": "speed", "source": "benchmark"} | made_with
-    save("provenance", pandas.concat([old[~same], pandas.DataFrame([line])]), to)
+    same = (old.table == "speed") & old.source.isin(parts)
+    lines = [{"table": "speed", "source": part} | made_with for part in parts]
+    save("provenance", pandas.concat([old[~same], pandas.DataFrame(lines)]), to)
 
 
 def check_evaluation(path: Path, found: dict, experiment: str, controller: str | None) -> None:

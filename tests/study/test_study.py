@@ -250,7 +250,7 @@ def test_a_wrong_name_ends_in_one_line(options, message, tmp_path, capsys):
 def test_the_remaining_time_is_that_of_the_missing_stages(made):
     wanted = find_pipelines("tiny")
     runs = tables.read_study("runs", made / "data")
-    seconds = runs[[f"seconds.{stage}" for stage in study.STAGES]].mean().to_numpy()
+    seconds = runs[[f"seconds.{stage}" for stage in study.TIMED]].mean().to_numpy()
     hours = seconds @ [1, 2, 2, 4, 4] / 3600
     expected = f"4 of 8 pipelines are done, about {hours:.1f} hours are left"
     assert study.describe_progress("tiny", wanted, made / "data") == expected

@@ -94,5 +94,6 @@ def test_a_benchmark_takes_the_place_of_the_same_parts(tmp_path):
     others = [table[table.part != "loop"].reset_index(drop=True) for table in (before, after)]
     assert others[0].equals(others[1])
     made_with = tables.read("provenance", tmp_path)
-    line = made_with[(made_with.table == "speed") & (made_with.source == "benchmark")]
+    line = made_with[(made_with.table == "speed") & (made_with.source == "loop")]
     assert line.commit.tolist() == ["c0ffee"]
+    assert {"run", "cluster"} <= set(made_with[made_with.table == "speed"].source)
