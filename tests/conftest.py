@@ -46,11 +46,11 @@ def one_thread():
 
 
 def pytest_xdist_auto_num_workers():
-    """One process more than cores, because many tests wait for a browser, a kernel or a command.
+    """Two processes more than cores: many tests wait for a browser, a kernel or a command.
 
     There are at most 4: a laptop's memory holds no more.
     """
-    return min(4, os.cpu_count() + 1)
+    return min(4, os.cpu_count() + 2)
 
 
 def run_stad_lab(*arguments, **environment):
@@ -259,7 +259,7 @@ def interrupt_after():
         handle.remove()
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def live_pages(tmp_path_factory):
     """A folder with the live pages as plain HTML, and all their scripts."""
     sys.path.insert(0, str(LIVE))
@@ -286,6 +286,7 @@ def opened(browser, live_pages):
     errors, contexts = [], []
 
     def open_page(name, address="", **context):
+        context.setdefault("viewport", {"width": 800, "height": 500})  # less to draw
         contexts.append(browser.new_context(**context))
         page = contexts[-1].new_page()
         page.set_default_timeout(60_000)  # milliseconds: a busy machine is no fault

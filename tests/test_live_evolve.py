@@ -35,7 +35,10 @@ def evolve(page, generations):
 @pytest.fixture(scope="module")
 def running(browser, live_pages):
     """A page after two small generations, which draws seldom, and its errors."""
-    page, errors = browser.new_page(reduced_motion="reduce"), []
+    page, errors = (
+        browser.new_page(reduced_motion="reduce", viewport={"width": 800, "height": 500}),
+        [],
+    )
     page.set_default_timeout(60_000)  # milliseconds: a busy machine is no fault
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))

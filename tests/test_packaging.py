@@ -3,6 +3,7 @@
 import ast
 import contextlib
 import dis
+import functools
 import importlib.metadata
 import json
 import re
@@ -81,7 +82,7 @@ def test_every_range_has_an_upper_bound_and_box2d_py_is_not_required():
 
 
 def test_the_library_requires_every_package_that_it_imports():
-    distributions = importlib.metadata.packages_distributions()
+    distributions = packages_distributions()
     extras = {name for some in EXTRAS.values() for name in by_name(some)}
     brought = {"box2d", "pygame-ce"}  # by gymnasium[box2d]
     own = ("stad_lab", "stad_study", "stad_course")
@@ -155,10 +156,13 @@ from gymnasium.utils.env_checker import check_env
 
 NAME = "stad_lab:StadLab/CarRacing-v3"
 check_env(gymnasium.make(NAME).unwrapped, skip_render_check=True)
-env = gymnasium.make(NAME, render_mode="rgb_array")
-env.reset(seed=1)
-assert env.render().shape == (400, 600, 3)
-envs = gymnasium.make_vec(NAME, num_envs=16, vectorization_mode="vector_entry_point")
+env = gymnasium.make(NAME, render_mode="rgb_array", bar=False)
+assert env.reset(seed=1)[0].shape == (96, 96, 3) and env.render().shape == (400, 600, 3)
+assert (type(env.unwrapped).__name__, env.spec.max_episode_steps) == ("CarRacing", 1000)
+made = {"vectorization_mode": "vector_entry_point", "autoreset_mode": "SameStep"}
+envs = gymnasium.make_vec(NAME, num_envs=16, **made)
+assert (type(envs).__name__, envs.spec.id) == ("CarRacingVector", "StadLab/CarRacing-v3")
+assert (envs.max_episode_steps, envs.metadata["autoreset_mode"].value) == (1000, "SameStep")
 seen, _ = envs.reset(seed=1)
 for _ in range(3):
     seen, rewards, *_ = envs.step(envs.action_space.sample())
@@ -177,9 +181,12 @@ assert [*Path("films").glob("*.mp4")]
 """
 
 
+packages_distributions = functools.cache(importlib.metadata.packages_distributions)
+
+
 def blocker():
     """Code after which what the extras bring cannot be imported, as if it were not installed."""
-    modules = importlib.metadata.packages_distributions()
+    modules = packages_distributions()
     extras = {name for some in EXTRAS.values() for name in by_name(some)}
     return BLOCK.format(
         blocked={module for module, names in modules.items() if {*map(normal, names)} & extras}
@@ -208,7 +215,7 @@ def test_the_controller_needs_numpy_alone():
     code = "import sys, stad_lab.models.controller; print(*sys.modules)"
     loaded = {name.partition(".")[0] for name in run_code(code).stdout.split()}
     own = {normal(name) for some in (CORE, *EXTRAS.values()) for name in by_name(some)}
-    modules = importlib.metadata.packages_distributions()
+    modules = packages_distributions()
     assert {one for one in loaded if {*map(normal, modules.get(one, []))} & own} == {"numpy"}
 
 

@@ -283,5 +283,5 @@ def test_an_empty_name_is_not_the_present_folder(arguments, capsys):
 
 def test_a_folder_without_an_agent_is_told_what_it_lacks(tmp_path):
     (tmp_path / "notes").mkdir()
-    said = check_submission(tmp_path / "notes", Limits())
+    said = check_submission(tmp_path / "notes", Limits(), tracks=(0,))
     assert "neither agent.py with make_agent(), nor a run" in said

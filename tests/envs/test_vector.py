@@ -1,8 +1,5 @@
 """The vectorized environment does what Gymnasium's SyncVectorEnv does with single ones."""
 
-import subprocess
-import sys
-
 import gymnasium as gym
 import numpy as np
 import psutil
@@ -176,22 +173,6 @@ def test_vector_wrappers_of_gymnasium_work_on_it():
     for _ in range(LIMIT):
         info = envs.step(envs.action_space.sample())[-1]
     assert info["episode"]["l"].tolist() == [LIMIT] * 2
-
-
-def test_make_vec_finds_it_by_its_name_in_a_fresh_process():
-    code = """
-import gymnasium
-envs = gymnasium.make_vec(
-    "stad_lab:StadLab/CarRacing-v3", num_envs=4, vectorization_mode="vector_entry_point",
-    autoreset_mode="SameStep",
-)
-print(type(envs).__name__, envs.reset(seed=1)[0].shape, envs.metadata["autoreset_mode"].value)
-print(envs.spec.id, envs.max_episode_steps, envs.num_envs)
-"""
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert process.returncode == 0, process.stderr
-    expected = ["CarRacingVector (4, 96, 96, 3) SameStep", "StadLab/CarRacing-v3 1000 4"]
-    assert process.stdout.splitlines() == expected
 
 
 @pytest.mark.long

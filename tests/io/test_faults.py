@@ -343,7 +343,7 @@ def kill_at_random(stage, run, tmp_path, kills):
             assert process.stdout.readline().rstrip().endswith(b"nothing to do")
         begin = time.perf_counter()
         try:
-            process.wait(rng.uniform(0, duration))
+            process.wait(rng.uniform(0, duration if kills > 1 else duration / 2))
             duration = time.perf_counter() - begin  # it has ended, so it is quicker now
             folder = start_of(stage, run, tmp_path / f"run{killed}-{rng.random()}")
         except subprocess.TimeoutExpired:

@@ -11,6 +11,7 @@ import pytest
 from stad_lab.agent import Agent, drive
 from stad_lab.config import Config
 from stad_lab.envs.cars import Cars
+from stad_lab.evaluation import probe_run
 from stad_lab.evaluation.trajectories import true_motion
 from stad_lab.io.files import copy_file, load_json, load_tensors
 from stad_lab.io.weights import MDN_RNN_FILE, VAE_FILE, load_vae, save_mdn_rnn, save_vae
@@ -54,12 +55,13 @@ def networks(tmp_path_factory):
         trained = load_vae(run / VAE_FILE)[1]["weights"]
         save_mdn_rnn(run / MDN_RNN_FILE, mdn_rnn, config, vae=trained)
         keep_world_model(config, run, folder / f"study1/seed0/{variant}" / WORLD_MODEL_FILE)
-    tiny = {"seeds": (0,), "config": CONFIG, "tracks": range(1000, 1018), "max_frames": 30}
+    tiny = {"seeds": (0,), "config": CONFIG, "tracks": range(1000, 1003), "max_frames": 30}
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(STUDIES, "study1", dataclasses.replace(STUDIES["study1"], **tiny))
         patch.setattr(world_facts, "PROBED", 12)
         patch.setattr(world_facts, "PLACEBO_EPISODES", 2)
         patch.setattr(senses, "DRAWS", 1000)
+        patch.setattr(probe_run, "AGENT_FRAMES", 120)
         yield folder
 
 
@@ -90,7 +92,7 @@ def test_the_runs_of_a_repeat_drive_the_same_tracks_and_are_in_the_tables(made):
     returns = tables.read("study5_returns", made / "data")
     assert len(table) == len(returns) == 12
     assert np.allclose(
-        returns[[str(t) for t in range(1000, 1018)]].mean(axis=1), table["mean"], atol=0.01
+        returns[[str(t) for t in range(1000, 1003)]].mean(axis=1), table["mean"], atol=0.01
     )
     logs = [
         load_json(made / "study5" / run.name / LOG) for run in find_runs(STUDY5) if run.repeat == 1
@@ -203,6 +205,7 @@ def test_of_two_processes_one_prepares_a_seed_and_the_other_waits(
 
 def test_the_pilot_of_the_erasure_is_one_command(capsys, monkeypatch):
     monkeypatch.setattr(world_facts.measure_erasure, "__defaults__", (36, 2))
+    monkeypatch.setattr(probe_run, "AGENT_FRAMES", 360)
     assert main(["erasure", "cropped_input_output"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     read, erased = (

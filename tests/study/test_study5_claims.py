@@ -1,5 +1,6 @@
 """The statistics of study 5: nothing is tested before a part is complete, and effects are found."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -33,6 +34,20 @@ def write_tables(folder, runs):
         tables.save(f"study5_{name}", table, folder)
 
 
+@pytest.fixture(scope="module")
+def complete(tmp_path_factory):
+    """A folder with the tables of all runs."""
+    folder = tmp_path_factory.mktemp("complete")
+    write_tables(folder, find_runs(STUDY5))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def described(complete):
+    """Study 5 after its last run."""
+    return describe_study5(complete)
+
+
 def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
     assert describe_study5(tmp_path)["runs"] == {"5a": 0, "5b": 0, "5c": 0}
     write_tables(tmp_path, find_runs(STUDY5)[:-1])
@@ -45,8 +60,8 @@ def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
 
 
 @pytest.mark.parametrize("spoil", ["a return is missing", "a track is missing"])
-def test_a_table_with_a_gap_is_refused(tmp_path, spoil):
-    write_tables(tmp_path, find_runs(STUDY5))
+def test_a_table_with_a_gap_is_refused(complete, tmp_path, spoil):
+    shutil.copytree(complete, tmp_path, dirs_exist_ok=True)
     table = tables.read("study5_returns", tmp_path)
     if spoil == "a return is missing":
         table.loc[5, "1007"] = np.nan
@@ -59,17 +74,15 @@ def test_a_table_with_a_gap_is_refused(tmp_path, spoil):
         describe_study5(tmp_path)
 
 
-def test_the_learning_curve_of_an_arm_is_averaged_over_its_runs(tmp_path):
-    write_tables(tmp_path, find_runs(STUDY5))
-    arms = describe_study5(tmp_path)["arms"]
+def test_the_learning_curve_of_an_arm_is_averaged_over_its_runs(described):
+    arms = described["arms"]
     assert arms["frame: z + motion"]["curve"]["mean"] == [738, 840]
     assert arms["input_output: z"]["curve"]["low"] == [718, 820]
     assert arms["input_output: z"]["processors"] == {"a CPU": 36}
 
 
-def test_effects_are_found_and_corrected_within_their_family(tmp_path):
-    write_tables(tmp_path, find_runs(STUDY5))
-    found = describe_study5(tmp_path)["comparisons"]
+def test_effects_are_found_and_corrected_within_their_family(described):
+    found = described["comparisons"]
     expected = {"interaction": 0, "input_output less input": 20, "both with motion": 20}
     expected |= {"adding motion": 40, "erasing motion": -40, "remembering the action": 0}
     for name, points in expected.items():
@@ -85,10 +98,12 @@ def test_effects_are_found_and_corrected_within_their_family(tmp_path):
 
 
 @pytest.mark.parametrize(("missing", "rows"), [(0, 6), (1, 2), (289, 0)])
-def test_the_page_shows_the_tests_of_complete_parts_alone(tmp_path, missing, rows):
-    runs = find_runs(STUDY5)
-    write_tables(tmp_path, runs[: len(runs) - missing])
-    claims = {"study5": describe_study5(tmp_path)}
+def test_the_page_shows_the_tests_of_complete_parts_alone(described, tmp_path, missing, rows):
+    runs, study = find_runs(STUDY5), described
+    if missing:
+        write_tables(tmp_path, runs[: len(runs) - missing])
+        study = describe_study5(tmp_path)
+    claims = {"study5": study}
     page = blocks.cause(claims)
     lines = [line for line in page.splitlines() if line.startswith("| `")]
     assert len(lines) == rows and ("../notebooks/pictures/study5.png" in page) == (rows > 0)

@@ -14,6 +14,13 @@ from stad_lab.evaluation.statistics import summarise
 from stad_lab.io.files import save_json
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE
 from stad_lab.viz.report import report
+from stad_lab.viz.video import FILM
+
+
+@pytest.fixture(autouse=True)
+def short_films(monkeypatch):
+    """Films of 30 frames, so that a report takes a second."""
+    monkeypatch.setitem(FILM, "frames", 30)
 
 
 @pytest.fixture
