@@ -5,6 +5,7 @@ import pandas
 import pytest
 from scipy import stats
 
+from stad_lab.training.pipeline import STAGES
 from stad_study import tables
 from stad_study.study import find_pipelines
 from stad_study.study6_claims import RECIPES, describe_study6
@@ -25,6 +26,7 @@ def write_tables(folder, difference, without=None, wrong=()):
                 episodes.append(pandas.DataFrame(lines).assign(**one._asdict()))
                 made = {"world_model.trained_on": "cpu", "processor": "p", "kept_controller": "c"}
                 made |= {"dataset": f"d{one.seed}", "config.vae.steps": one.config.vae.steps}
+                made |= {f"seconds.{stage}": 60 * (recipe == RECIPES[0]) + 60 for stage in STAGES}
                 runs.append(one._asdict() | made)
     runs[-1] |= dict(wrong)
     tables.save("study_episodes", pandas.concat(episodes), folder)
@@ -49,6 +51,7 @@ def test_the_bound_is_that_of_a_one_sided_paired_t_test(tmp_path, difference, no
     assert found["difference"] == pytest.approx(np.mean(pairs))
     assert found["lower_bound"] == pytest.approx(test.confidence_interval(0.95).low)
     assert found["not_worse"] is not_worse
+    assert found["minutes"] == {"study6_laptop": 8, "study6_fast": 4}  # four stages
     by_seed = np.mean([pairs[::2], pairs[1::2]], axis=0)  # find_pipelines gives both variants
     low = stats.ttest_1samp(by_seed, 0, alternative="greater").confidence_interval(0.95).low
     assert found["lower_bound_of_seeds"] == pytest.approx(low)
