@@ -27,7 +27,7 @@ LONGEST_STRIDE = 8
 RANDOM_FRAMES, AGENT_FRAMES = 150, 360  # of a trajectory of the random driver, and of the agent
 # First frames that are not probed: without a difference image, or with the opening zoom.
 RANDOM_SKIP, AGENT_SKIP = LONGEST_STRIDE, 60
-FEWEST_TRAJECTORIES = 12  # trajectories: a probe is fitted on some and measured on others
+FEWEST_TRAJECTORIES = 12  # a probe is fitted on some and measured on others
 PROBED, PROBE_SEED = 180, 100  # trajectories when one run is probed; no counted run has this seed
 AGENT = "cropped_input"  # the competent driver whose trajectories are probed
 
