@@ -40,7 +40,7 @@ from stad_lab.io.weights import load_world_model
 from stad_lab.io.workers import run_in_order, worker_threads
 from stad_lab.training.dataset import MANIFEST, dataset_checksum, load_manifest
 from stad_lab.training.evolution import LOG, drive_group, hand_out, read_log, resume
-from stad_lab.training.pipeline import train
+from stad_lab.training.pipeline import STAGES, train
 from stad_lab.training.record import RECORD
 from stad_study import tables
 from stad_study.networks import (
@@ -59,7 +59,7 @@ CARS = 16  # cars that drive in one batch: another number would change last bits
 THREADS = 1  # that train V and M, on every machine: last bits depend on their number
 WAIT = 120.0  # seconds to wait for another process that writes the tables
 COLLECTING = 3600.0  # seconds to wait for another process that collects the dataset
-TIMED = ("dataset", "vae", "mdn_rnn", "controller", "score")
+TIMED = (*STAGES, "score")
 MADE_WITH = ("commit", "processor", "threads", "torch", "trained_on")  # that is noted of V and M
 
 

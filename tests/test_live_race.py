@@ -204,13 +204,19 @@ CLICK_ALL = "(one) => one.querySelectorAll('button').forEach((button) => button.
 STORY = ("speed", "eye", "dream", "wheel", "breed", "study", "hairpin")
 
 
+def bring_near(page, name):
+    """Scroll a figure of the story into sight, and wait until it is ready."""
+    figure = page.locator(f"[data-figure={name}]")
+    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
+    page.wait_for_selector(f"[data-figure={name}][data-state=ready]")
+    return figure
+
+
 def test_every_figure_of_the_story_works_when_it_comes_near_and_bears_impatient_clicks(opened):
     page = opened("story", viewport={"width": 390, "height": 844})
     assert page.evaluate("document.documentElement.scrollWidth") <= 390
     for name in STORY:
-        figure = page.locator(f"[data-figure={name}]")
-        figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
-        page.wait_for_selector(f"[data-figure={name}][data-state=ready]")
+        figure = bring_near(page, name)
         for _ in range(3):
             figure.evaluate(CLICK_ALL)
         page.wait_for_timeout(50)
@@ -219,9 +225,7 @@ def test_every_figure_of_the_story_works_when_it_comes_near_and_bears_impatient_
 
 def test_the_bend_that_the_agent_leaves_is_driven_live(opened):
     page = opened("story", reduced_motion="reduce")
-    figure = page.locator("[data-figure=hairpin]")
-    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
-    page.wait_for_selector("[data-figure=hairpin][data-state=ready]")
+    figure = bring_near(page, "hairpin")
     marks = figure.locator("[data-part=map]")
     for _ in range(10):
         marks.press("ArrowLeft")
@@ -255,9 +259,7 @@ COUNT_DRIVES = """() => {
 
 def test_the_button_of_the_dreams_says_what_it_does(opened):
     page = opened("story")
-    figure = page.locator("[data-figure=dream]")
-    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
-    page.wait_for_selector("[data-figure=dream][data-state=ready]")
+    figure = bring_near(page, "dream")
     play, again = (figure.locator(f"[data-part={name}]") for name in ("play", "again"))
     figure.locator("[data-part=bets] button").first.click()
     play.get_by_text("Pause").wait_for()
@@ -282,9 +284,7 @@ MOVES_THE_PAGE = """() => {
 
 def test_the_reader_of_the_story_drives_as_long_as_c_and_gets_the_arrow_keys_back(opened):
     page = opened("story")
-    figure = page.locator("[data-figure=wheel]")
-    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
-    page.wait_for_selector("[data-figure=wheel][data-state=ready]")
+    figure = bring_near(page, "wheel")
     answer, seconds = (figure.locator(f"[data-part={name}]") for name in ("answer", "seconds"))
     in_seat = "document.activeElement.closest('[data-part=seat]') !== null"
     figure.locator("[data-part=you]").click()
@@ -300,7 +300,7 @@ def test_the_reader_of_the_story_drives_as_long_as_c_and_gets_the_arrow_keys_bac
     page.wait_for_function(f"!({in_seat})")
     assert page.evaluate(MOVES_THE_PAGE)
     page.evaluate("stad.Dream.prototype.step = function () { this.frames += 25 }")  # stays on it
-    figure.evaluate("(one) => one.scrollIntoView({ block: 'center' })")
+    bring_near(page, "wheel")
     for name in ("you", "agent"):
         figure.locator(f"[data-part={name}]").click()
         answer.get_by_text("to the end").wait_for()

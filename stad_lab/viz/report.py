@@ -52,9 +52,8 @@ def scores(folder: Path) -> str:
             f"mean {one['mean']:.1f} (95% interval {low:.1f} to {high:.1f}), minimum"
             f" {tail['minimum']:.1f}, above {SOLVED}: {100 * one['above_900']:.0f}%"
         )
-    official = [one["renderer"] == "gymnasium" for one in found]
-    best = max(range(len(found)), key=lambda n: (official[n], len(found[n]["episodes"])))
-    return f"<p class=number>Mean return {found[best]['mean']:.1f}</p>{table(rows)}"
+    main = max(found, key=lambda one: (one["renderer"] == "gymnasium", len(one["episodes"])))
+    return f"<p class=number>Mean return {main['mean']:.1f}</p>{table(rows)}"
 
 
 def film(folder: Path) -> str:
