@@ -87,16 +87,16 @@ def gains(claims: dict) -> str:
     study, told = claims["study1"], []
     for features in SEEN:
         one = study["comparisons"][f"{features}: input_output"]
-        low, high = one["interval"]
-        told.append(f"{one['difference'] + 0.0:.0f} points ({low:.0f} to {high:.0f})")
+        points = f"{one['difference'] + 0.0:.0f} points".replace("-0 ", "0 ")
+        told.append(f"*{one['verdict']}* ({points})")
     both, alone = told
     differ = describe_interaction(study["afterwards"]["interaction"])
     text = (
         "Does it help to see and reconstruct what has moved? A paper says so. In our study of"
-        f" twelve pairs it adds {both} if the controller sees the memory, as it probably does"
-        f" there, and {alone} if it does not (95% intervals). {differ}"
+        f" twelve pairs, if the controller sees the memory, as it probably does there: {both}."
+        f" If it does not: {alone}. {differ}"
     )
-    return text.replace(" -0 ", " 0 ")
+    return text
 
 
 def verdict_figure(claims: dict) -> str:
@@ -115,10 +115,13 @@ def afterwards(claims: dict) -> str:
     for features, seen in SEEN.items():
         names[f"{features}: input_output less input"] = f"`input_output` - `input`, {seen}"
     names["input_output less input"] = CAUSE["input_output less input"]
-    lines = []
+    lines, by_seed = [], claims["study1"]["afterwards"]["interaction"]["by_seed"]
     for name, title in names.items():
         one = claims["study1"]["afterwards"][name]
         lines.append((title, difference_of(one), p_value(one["p"])))
+    one, title = claims["studies1_and_6"], "`input_output` - `frame`, C sees z and h"
+    title += f", with {len(one['by_seed']) - len(by_seed)} seeds of study 6"
+    lines.append((title, difference_of(one), p_value(one["p"])))
     return table(("comparison", "difference (95% interval)", "p"), lines)
 
 
@@ -129,7 +132,8 @@ def cause(claims: dict) -> str:
     parts = [f"Runs done: {', '.join(counts)}."]
     if study["comparisons"]:
         verdicts = "\n".join(f"- {sentence}" for sentence in describe_cause(study))
-        parts = [verdicts, image("study5", claims), cause_table(study), *parts]
+        tables = [cause_table(study), repeated_table(study, claims["study1"])]
+        parts = [verdicts, image("study5", claims), *tables, *parts]
     return "\n\n".join(parts)
 
 
@@ -145,6 +149,19 @@ def cause_table(study: dict) -> str:
             lines.append((*cells, *tests, one.get("verdict", "described")))
     head = ("comparison", "difference (95% interval)", "t-interval", "p", "Holm's p", "verdict")
     return table(head, lines)
+
+
+def repeated_table(study: dict, first: dict) -> str:
+    """The arms of part 5a, each beside the same arm of study 1."""
+    lines = []
+    for variant in ("frame", "input", "input_output"):
+        arms = (f"{features}: {variant}" for features in SEEN)
+        both = [
+            (study["arms"][f"{variant}: {features}"]["mean"], first["arms"][arm]["mean"])
+            for features, arm in zip(SEEN, arms, strict=True)
+        ]
+        lines.append((f"`{variant}`", *(f"{now:.0f} (study 1: {then:.0f})" for now, then in both)))
+    return table(("mean of the seeds", *SEEN.values()), lines)
 
 
 def outcomes(claims: dict) -> str:
@@ -166,7 +183,7 @@ def comparisons_table(study: dict) -> str:
             cells = (family, f"`{variant}`, {SEEN[features]}", difference_of(one))
             cells += (f"{low:.1f} to {high:.1f}", f"{one['deviation']:.0f}")
             lines.append((*cells, *(p_value(one[key]) for key in ("p", "holm_p")), outcome))
-    head = ("test", "variant less `frame`", "difference (95% interval)", "t-interval")
+    head = ("test", "variant minus `frame`", "difference (95% interval)", "t-interval")
     return table((*head, "SD of pairs", "p", "Holm's p", "verdict"), lines)
 
 
@@ -186,7 +203,7 @@ def outcomes_table(study: dict) -> str:
         name = f"`{variant}`, {SEEN[features]}"
         lines.append((name, mean, f"{one['below_800']:.1%}", *scores, lead))
     head = ("arm", "mean", "below 800", "interquartile mean", "10th percentile", "minimum")
-    return table((*head, "area", "area less that of `frame`"), lines)
+    return table((*head, "area", "area minus that of `frame`"), lines)
 
 
 def area_of(study: dict, features: str, variant: str) -> str:

@@ -45,7 +45,7 @@ def plot_deal(runs: np.ndarray, reach: float) -> Figure:
     for row, (pair, color) in enumerate(zip(runs, (BLUE, GREEN), strict=True)):
         axis.plot(pair, [row, row], "o", color=color, ms=9)
         axis.plot([pair.mean()] * 2, [row - 0.3, row + 0.3], color="black", lw=2)
-    axis.set(xlim=(-reach, reach), xlabel="score of a run, less the mean of all four")
+    axis.set(xlim=(-reach, reach), xlabel="score of a run, minus the mean of all four")
     name_rows(axis, ["A", "B"])
     means = [f"{name} {pair.mean():+.0f}" for name, pair in zip("AB", runs, strict=True)]
     return describe(figure, "Two runs of each, and their means", "Means: ", means)

@@ -40,6 +40,7 @@ def compute_claims() -> dict[str, dict]:
         "study3": study_claims.describe_study3(),
         "study5": study5_claims.describe_study5(),
         "study6": study6_claims.describe_study6(),
+        "studies1_and_6": study6_claims.compare_with_study1(),
         "agents": describe_agents(),
         "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
         "probe": measurements.describe_probe(tables.read("probe")),

@@ -22,12 +22,14 @@ SEEN = {"z, h": "C sees z and h", "z": "C sees z"}
 DRIVERS = {"agent": "an agent", "random_driver": "the random driver"}
 SOURCES = {"z": "z", "z, h": "z and h"}
 CAUSE = {  # the comparisons of study 5, in Markdown
-    "interaction": "`input_output` - `frame`: with z, less the same with z and h",
+    "interaction": "`input_output` - `frame`: with z, minus the same with z and h",
     "input_output less input": "`input_output` - `input`, mean of both C",
-    "adding motion": "`frame`: z + motion, less z + placebo",
-    "erasing motion": "`input_output`: z - motion, less z - placebo",
+    "effect with z": "`input_output` - `frame`, C sees z",
+    "effect with z and h": "`input_output` - `frame`, C sees z and h",
+    "adding motion": "`frame`: z + motion, minus z + placebo",
+    "erasing motion": "`input_output`: z - motion, minus z - placebo",
     "both with motion": "`input_output` - `frame`, both with z + motion",
-    "remembering the action": "`frame`: z + action, less z + placebo",
+    "remembering the action": "`frame`: z + action, minus z + placebo",
 }
 TURNING = ("slip speed", "yaw rate", "wheel angle")  # what a single frame does not show
 
@@ -39,7 +41,7 @@ def difference_of(one: dict) -> str:
 
 
 def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> Figure:
-    """The forest plot of study 1: each pipeline less `frame` of its seed, and the mean of these.
+    """The forest plot of study 1: each pipeline minus `frame` of its seed, and the mean of these.
 
     Args:
         comparisons: "FEATURES: VARIANT" -> "difference", "interval", "by_seed" and "verdict".
@@ -57,7 +59,7 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
             plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
         name_rows(axis, variants)
         axis.set_title(title, loc="left", fontsize=10)
-    axes[1, 0].set_xlabel("mean return less that of frame with the same seed, points")
+    axes[1, 0].set_xlabel("mean return minus that of frame with the same seed, points")
     legend_below(figure, axes[0, 0])
     told = []
     for features, seen in SEEN.items():
@@ -103,7 +105,7 @@ def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
     draw_margin(axis, margin)
     for height, one in enumerate(rows.values()):
         plot_comparison(axis, height, one, COLOURS["input_output"])
-    name_rows(axis, [title.replace(", less", ",\nless") for title in rows])
+    name_rows(axis, [title.replace(", minus", ",\nminus") for title in rows])
     axis.set_xlabel("difference, points")
     legend_below(figure, axis)
     told = [f"{title} {difference_of(one)}" for title, one in rows.items()]
@@ -133,7 +135,7 @@ def plot_scores(arms: dict[str, dict]) -> Figure:
 
 
 def plot_learning_curves(curves: dict[str, dict]) -> Figure:
-    """Validation means of study 1 less those of `frame`, against all episodes driven.
+    """Validation means of study 1 minus those of `frame`, against all episodes driven.
 
     Args:
         curves: "FEATURES: VARIANT" -> "episodes", "mean", "low" and "high" of the difference.
@@ -147,11 +149,11 @@ def plot_learning_curves(curves: dict[str, dict]) -> Figure:
             axis.fill_between(one["episodes"], one["low"], one["high"], color=colour, alpha=0.15)
             axis.plot(one["episodes"], one["mean"], dash, color=colour, label=variant)
         caption(axis, title, "episodes, those of the dataset included")
-    axes[0, 0].set_ylabel("validation mean less that of frame")
+    axes[0, 0].set_ylabel("validation mean minus that of frame")
     legend_below(figure, axes[0, 0])
     ends = [f"{seen}: " + ", ".join(f"{one} {curves[f'{features}: {one}']['mean'][-1]:+.0f}"
             for one in variants) for features, seen in SEEN.items()]  # fmt: skip
-    title = "Study 1: learning curves less that of frame, with 95% intervals of the mean"
+    title = "Study 1: learning curves minus that of frame, with 95% intervals of the mean"
     return describe(figure, title, "At the end: ", ends)
 
 
@@ -196,7 +198,7 @@ def plot_probe(panels: dict[str, dict], title: str) -> Figure:
 
 
 def plot_primary(comparisons: dict[str, dict], margin: float) -> Figure:
-    """The two primary differences of study 1, for the overview: `input_output` less `frame`.
+    """The two primary differences of study 1, for the overview: `input_output` minus `frame`.
 
     Args:
         comparisons, margin: as of `plot_study`.

@@ -37,6 +37,10 @@ FAMILIES: Families = {  # the parts that must be complete -> comparison -> arms 
     },
 }
 DESCRIBED: Families = {  # without a test
+    ("5a",): {
+        "effect with z": ({"input_output: z": 1}, {"frame: z": 1}),
+        "effect with z and h": ({"input_output: z, h": 1}, {"frame: z, h": 1}),
+    },
     ("5b", "5c"): {
         "both with motion": ({"input_output: z + motion": 1}, {"frame: z + motion": 1}),
         "remembering the action": ({"frame: z + action": 1}, {"frame: z + placebo": 1}),
@@ -97,8 +101,13 @@ def by_arm(table: pandas.DataFrame, parts: list[str]) -> dict[str, np.ndarray]:
     found = {}
     for variant, sees in (arm for part in parts for arm in ARMS[part]):
         seeds = STUDIES["study1"].seeds
-        runs = [[table.loc[(seed, variant, sees, n)] for n in REPEATS] for seed in seeds]
-        found[f"{variant}: {sees}"] = np.mean(runs, axis=1)
+        names = [[(seed, variant, sees, n) for n in REPEATS] for seed in seeds]
+        for name in (name for own in names for name in own):
+            if name not in table.index:
+                raise ValueError(f"study 5: the run {name} is not in both tables: run it again")
+        found[f"{variant}: {sees}"] = np.mean(
+            [[table.loc[name] for name in own] for own in names], axis=1
+        )
     return found
 
 

@@ -42,7 +42,7 @@ def describe_study1(folder: Path = tables.DATA) -> dict:
     found |= {"arms": arms, "comparisons": comparisons}
     found |= {"afterwards": compare_afterwards(returns)}
     found |= {"verdicts_without_a_seed": leave_one_out(returns)}
-    found |= {"equivalence": describe_equivalence(returns)}
+    found |= {"equivalence": describe_equivalence(returns), "ceiling": find_ceiling(returns)}
     return found | {"curves": bands, "curve_differences": curve_differences(curves)}
 
 
@@ -171,6 +171,14 @@ def describe_equivalence(returns: dict[str, np.ndarray]) -> dict[str, dict]:
         stays = sum(statistics.equivalence_p(own, MARGIN) < LEVEL for own in without)
         found[features] = {"p": statistics.equivalence_p(by_seed, MARGIN), "stays": stays}
     return found
+
+
+def find_ceiling(returns: dict[str, np.ndarray]) -> float:
+    """Mean over tracks of the best return that any pipeline of any arm has there.
+
+    The protocol does not have it: it shows how much a variant could gain over `frame`.
+    """
+    return float(np.max([own.max(axis=0) for own in returns.values()], axis=0).mean())
 
 
 def find_verdict(interval: list[float], holm_p: float) -> str:

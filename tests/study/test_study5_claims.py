@@ -9,6 +9,7 @@ import pandas
 import pytest
 
 from stad_study import tables
+from stad_study.claims import read_claims
 from stad_study.evolved import find_runs
 from stad_study.study5 import STUDY5
 from stad_study.study5_claims import describe_study5
@@ -53,7 +54,9 @@ def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path):
     write_tables(tmp_path, find_runs(STUDY5)[:-1])
     found = describe_study5(tmp_path)
     assert found["runs"] == {"5a": 216, "5b": 72, "5c": 143}
-    assert set(found["comparisons"]) == {"interaction", "input_output less input"}
+    tested = {"interaction", "input_output less input"}
+    assert set(found["comparisons"]) == tested | {"effect with z", "effect with z and h"}
+    assert "p" not in found["comparisons"]["effect with z"]
     assert "frame: z" in found["arms"]
     for hidden in ("frame: z + motion", "input_output: z - motion"):  # of a family that goes on
         assert hidden not in found["arms"]
@@ -74,6 +77,14 @@ def test_a_table_with_a_gap_is_refused(complete, tmp_path, spoil):
         describe_study5(tmp_path)
 
 
+def test_a_run_without_its_returns_is_named(complete, tmp_path):
+    shutil.copytree(complete, tmp_path, dirs_exist_ok=True)
+    table = tables.read("study5_returns", tmp_path)
+    tables.save("study5_returns", table.drop(index=5), tmp_path)
+    with pytest.raises(ValueError, match=r"the run .*, 3\) is not in both tables"):
+        describe_study5(tmp_path)
+
+
 def test_the_learning_curve_of_an_arm_is_averaged_over_its_runs(described):
     arms = described["arms"]
     assert arms["frame: z + motion"]["curve"]["mean"] == [738, 840]
@@ -84,6 +95,7 @@ def test_the_learning_curve_of_an_arm_is_averaged_over_its_runs(described):
 def test_effects_are_found_and_corrected_within_their_family(described):
     found = described["comparisons"]
     expected = {"interaction": 0, "input_output less input": 20, "both with motion": 20}
+    expected |= {"effect with z": 20, "effect with z and h": 20}
     expected |= {"adding motion": 40, "erasing motion": -40, "remembering the action": 0}
     for name, points in expected.items():
         assert found[name]["difference"] == pytest.approx(points, abs=8), name
@@ -97,13 +109,13 @@ def test_effects_are_found_and_corrected_within_their_family(described):
     assert {"verdict", "p"}.isdisjoint(found["both with motion"])
 
 
-@pytest.mark.parametrize(("missing", "rows"), [(0, 6), (1, 2), (289, 0)])
+@pytest.mark.parametrize(("missing", "rows"), [(0, 11), (1, 7), (289, 0)])
 def test_the_page_shows_the_tests_of_complete_parts_alone(described, tmp_path, missing, rows):
     runs, study = find_runs(STUDY5), described
     if missing:
         write_tables(tmp_path, runs[: len(runs) - missing])
         study = describe_study5(tmp_path)
-    claims = {"study5": study}
+    claims = {"study5": study, "study1": read_claims()["study1"]}
     page = blocks.cause(claims)
     lines = [line for line in page.splitlines() if line.startswith("| `")]
     assert len(lines) == rows and ("../notebooks/pictures/study5.png" in page) == (rows > 0)
