@@ -67,7 +67,7 @@ def describe_others(comparisons: dict[str, dict]) -> str:
 
 
 def describe_paper_gain(study: dict) -> str:
-    """How many intervals lie below the paper's gain of their variant, and where it is out of reach."""
+    """How many intervals end below the gain of the paper, and where none could reach it."""
     comparisons = study["comparisons"]
     below = [
         one["interval"][1] < PAPER_GAINS[name.partition(": ")[2]]
