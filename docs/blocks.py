@@ -78,8 +78,12 @@ def finding(claims: dict) -> str:
 
 
 def verdict(claims: dict) -> str:
-    """The verdict of study 1, a line for each sentence."""
-    return "\n".join(f"- {sentence}" for sentence in describe_verdict(claims["study1"]))
+    """The verdict of study 1, a line for each sentence; and once it is known, that of part 5a."""
+    told = describe_verdict(claims["study1"])
+    if claims["study5"]["comparisons"]:
+        first, *_ = describe_cause(claims["study5"])
+        told.insert(3, f"[Repeated](#is-it-the-motion) with three C for each V and M: {first}")
+    return "\n".join(f"- {sentence}" for sentence in told)
 
 
 def gains(claims: dict) -> str:
