@@ -89,16 +89,19 @@ def test_where_nothing_can_be_written_it_compiles_each_time(read_only_package):
 def test_compiling_is_announced_by_one_line_and_done_once_for_two_processes_that_start_together(
     tmp_path,
 ):
-    code = SMALL + "print(sum(physics.along.stats.cache_hits.values()))"
+    hits = "sum(sum(one.stats.cache_hits.values()) for one in (physics.cross, physics.along))"
+    code = SMALL + f"print({hits})"
     both = [start(code, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2)]
     loaded = {}
     for process in both:
         output, errors = process.communicate(timeout=300)
         assert process.returncode == 0 and output.startswith("-1.0\n(10.0, -2.0)\n")
-        loaded[output.splitlines()[-1]] = errors.splitlines()
-    assert loaded["0"] == [NOTICE] and loaded["1"] in ([NOTICE], [])
+        loaded[int(output.splitlines()[-1])] = errors.splitlines()
+    # What the second had looked for before the first kept it, it compiles itself: one at most.
+    second = max(loaded)
+    assert loaded[0] == [NOTICE] and second in (1, 2) and loaded[second] == [NOTICE] * (2 - second)
     output, errors = run(code, NUMBA_CACHE_DIR=str(tmp_path))
-    assert output[:2] == ["-1.0", "(10.0, -2.0)"] and output[-1] == "1" and errors == []
+    assert output[:2] == ["-1.0", "(10.0, -2.0)"] and output[-1] == "2" and errors == []
 
 
 def test_a_process_that_was_killed_while_it_compiled_stops_no_other(tmp_path):

@@ -188,7 +188,7 @@ def test_nothing_is_tested_before_the_last_pipeline_is_there(full, tmp_path):
 
 
 def test_the_pages_have_every_result_of_the_study(found):
-    claims = {"study1": found}
+    claims = {"study1": found, "study5": {"comparisons": {}}}
     numbers = [blocks.NUMBERS[name](claims) for name in ("networks of a GPU", "trained networks")]
     assert numbers == [12, 48]
     page = blocks.study1(claims)
