@@ -30,26 +30,29 @@ def replicate(
     pipelines of a study are added to the tables of stad_study/data as they finish.
 
     Args:
-        experiment: Its name: study1, study2, study5, study6_laptop, study6_fast, pilot, or one
-            of docs/experiments.md.
+        experiment: Its name: study1, study2, study4, study5, study6_laptop, study6_fast, pilot,
+            or one of docs/experiments.md.
         out: Folder of all experiments, for example runs/replication.
         seeds: Some of its seeds; all if not given.
-        only: Some pipelines of a study, such as seed0/frame/z, or runs of study5 or study2, such
-            as seed0/frame/z/1 or seed300/frame/4. Known ones are compared.
+        only: Some pipelines of a study, such as seed0/frame/z, or runs of study5, study2 or
+            study4, such as seed0/frame/z/1, seed300/frame/4 or seed400/frame. Known ones are
+            compared.
         keep: Only add the finished seeds of an earlier experiment to the tables.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
-    from stad_study import evolved, run, study
+    from stad_study import evolved, run, study, study4
     from stad_study.study2 import STUDY2
     from stad_study.study5 import STUDY5
 
-    folder = output(out)
-    for one in (STUDY2, STUDY5):
-        if experiment == one.name:
-            if keep or scheduler:
-                raise ValueError(f"{one.name} takes neither --keep nor --scheduler")
-            evolved.run_evolved(one, folder, seeds, only)
-            return
+    folder, own = output(out), {one.name: one for one in (STUDY2, STUDY5)}
+    if experiment in (*own, study4.NAME):
+        if keep or scheduler:
+            raise ValueError(f"{experiment} takes neither --keep nor --scheduler")
+        if experiment == study4.NAME:
+            study4.run_study4(folder, seeds, only)
+        else:
+            evolved.run_evolved(own[experiment], folder, seeds, only)
+        return
     if experiment in study.STUDIES:
         if keep:
             raise ValueError("--keep is for earlier experiments: a study adds its own pipelines")

@@ -13,17 +13,27 @@ from stad_lab.training.record import RECORD
 
 
 def ship(folder: str | Path, name: str) -> Path:
-    """Copy a run into `stad_lab/pretrained/NAME`: V and M in half precision, C, and its record.
+    """Copy a run into `stad_lab/pretrained/NAME`, as `copy_in_half` does; returns the new folder.
 
-    Evaluate the shipped agent after this, not the run. Returns the new folder; what an agent of
-    that name left there is removed. FileNotFoundError if the run has no V; ValueError if it is
-    damaged, or is the shipped agent itself.
+    Evaluate the shipped agent after this, not the run. ValueError for a wrong name, or if the run
+    is the shipped agent itself; and as `copy_in_half`.
     """
     folder, target = Path(folder), PRETRAINED / name
     load_vae(folder / VAE_FILE)
     if target.resolve() == folder.resolve() or not name.isidentifier():
         expected = "a new name of letters, digits and _, and another folder"
         raise ValueError(f"name={name!r}, folder={folder}: expected {expected}")
+    copy_in_half(folder, target)
+    return target
+
+
+def copy_in_half(folder: Path, target: Path) -> None:
+    """Copy what an agent needs of a run: V and M in half precision, C, and its record.
+
+    What an agent left in `target` is removed, but for its card. FileNotFoundError if the run has
+    no V; ValueError if it is damaged.
+    """
+    load_vae(folder / VAE_FILE)
     shipped = [one for one in (*WEIGHTS, RECORD, LOG) if (folder / one).exists()]
     read = {one: load_tensors(folder / one) for one in shipped if one in WEIGHTS}  # all, then write
     for one, (tensors, metadata) in read.items():
@@ -35,4 +45,3 @@ def ship(folder: str | Path, name: str) -> Path:
     for file in target.glob("*.*"):
         if file.is_file() and file.name not in shipped and file.suffix != ".md":
             file.unlink()
-    return target

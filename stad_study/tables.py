@@ -29,6 +29,7 @@ RUN = ["experiment", "role", "seed"]
 PIPELINE = ["study", "variant", "features", "seed"]
 SENSED = ["seed", "variant", "sees", "repeat"]  # names a run of study 5
 BUDGET = ["seed", "variant", "episodes"]  # names a run of study 2
+AGENT = ["seed", "variant"]  # names a run of study 4
 TABLES = {  # name -> columns that name a line, and others that each line must have
     "episodes": (["experiment", "seed", "track"], ["return", "frames"]),
     "fast_episodes": (["agent", "processor", "track"], ["return", "frames"]),
@@ -47,6 +48,8 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
     ),
     "study2_runs": (BUDGET, ["mean", "processor", "controller"]),
     "study2_returns": (BUDGET, ["1000"]),
+    "study4_runs": (AGENT, ["mean", "validation", "processor", "controller"]),
+    "study4_returns": (AGENT, ["6000"]),
     "study5_runs": (SENSED, ["mean", "processor", "controller"]),
     "study5_returns": (SENSED, ["1000"]),
     "study_probe": ([*PIPELINE, "trained", "driver", "quantity"], ["r2"]),
@@ -195,7 +198,7 @@ def add_log(run: dict, log: list[dict], to: Path) -> None:
 
 def replace_lines(name: str, lines: pandas.DataFrame, folder: Path) -> None:
     """Write a table with new lines in the place of those of the same run or pipeline."""
-    naming = {*RUN, *PIPELINE, *SENSED, *BUDGET}
+    naming = {*RUN, *PIPELINE, *SENSED, *BUDGET, *AGENT}
     run = [column for column in TABLES[name][0] if column in naming]
     if (folder / f"{name}.csv").exists():
         old = read(name, folder)

@@ -1,0 +1,188 @@
+"""Study 4 of docs/protocol.md: the strongest recipe, whole, for four variants and three seeds.
+
+In the folder of the study::
+
+    seed400/dataset/          of the random driver, for all variants of the seed
+    seed400/frame/first/      the first iteration: V, M and C
+    seed400/frame/second/     the second, with a dataset of its own
+    seed400/frame/tuned/      V and M of the second, and C after fine-tuning
+    seed400/frame/agent/      the same in half precision, as an agent is shipped
+    seed400/frame/score.json
+
+Whatever is there is not done again. A finished run is added to the tables. Of each variant the
+agent with the best validation is kept in `networks/study4`, to be shipped.
+"""
+
+import contextlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas
+
+from stad_lab.agent import load_agent
+from stad_lab.config import VARIANTS, Config
+from stad_lab.evaluation.statistics import FAILED
+from stad_lab.io.files import checksum_of_arrays, load_json, locked, save_json
+from stad_lab.training.evolution import LOG
+from stad_lab.training.fine_tuning import fine_tune
+from stad_lab.training.pipeline import train
+from stad_lab.training.record import RECORD, total_budget
+from stad_study import tables
+from stad_study.experiments import EXPERIMENTS
+from stad_study.networks import NETWORKS
+from stad_study.ship import copy_in_half
+from stad_study.study import (
+    COLLECTING,
+    SCORE,
+    WAIT,
+    drive_tracks,
+    fixed_threads,
+    refuse_finished,
+    select,
+)
+
+NAME = "study4"
+SEEDS = range(400, 403)
+TRACKS = range(6000, 6400)  # of the score, with the fast renderer
+VALIDATION = 64  # tracks of a validation in the fine-tuning, by which agents are chosen
+STAGES = ("first", "second", "tuned")
+
+
+class Run(NamedTuple):
+    """One agent; its name is also its folder."""
+
+    seed: int
+    variant: str
+
+    @property
+    def name(self) -> str:
+        """For example "seed400/frame"."""
+        return f"seed{self.seed}/{self.variant}"
+
+    @property
+    def configs(self) -> dict[str, Config]:
+        """The configuration of each stage."""
+        base = EXPERIMENTS[f"two_iterations_{self.variant}"]
+        tuned = EXPERIMENTS[f"fine_tuned_{self.variant}"].config
+        tuned = tuned.replace(evolution={"validation_tracks": VALIDATION})
+        own = {"seed": self.seed, "processes": 1, "evolution": {"seed": self.seed}}
+        found = zip(STAGES, (base.first, base.config, tuned), strict=True)
+        return {stage: config.replace(**own) for stage, config in found if config}
+
+
+def find_runs(seeds: Sequence[int] | None = None, only: Sequence[str] | None = None) -> list[Run]:
+    """All runs, of some seeds, or some by name. ValueError for an unknown seed or name."""
+    found = [Run(seed, variant) for seed in SEEDS for variant in VARIANTS]
+    return select(NAME, found, seeds, only)
+
+
+def run_study4(
+    folder: str | Path,
+    seeds: Sequence[int] | None = None,
+    only: Sequence[str] | None = None,
+    to: Path = tables.DATA,
+) -> None:
+    """Run what the tables in `to` lack, in `folder/study4`, and add each run to them.
+
+    After an interruption the same call continues. A run that another process does is left to it;
+    each computes on one thread. With `only`, recorded runs are run, too, and compared. ValueError
+    as `find_runs`, and for a folder with a recorded run that `only` names.
+    """
+    root, wanted = Path(folder) / NAME, find_runs(seeds, only)
+    for run in wanted if only else ():
+        if recorded(run, to):
+            refuse_finished(root / run.name)
+    for run in wanted:
+        with contextlib.ExitStack() as stack:
+            try:
+                stack.enter_context(locked(root / run.name))
+            except BlockingIOError:
+                continue
+            was = recorded(run, to)
+            if was and not only:
+                continue
+            print(f"{run.name}: {describe_progress(to)}", flush=True)
+            score = run_one(run, root)
+            found = f"mean return {score['mean']:.1f}"
+            if was:
+                found += f", recorded {was['mean']:.1f} on {was['processor']}"
+            else:
+                add_run(run, root, to)
+            print(f"{run.name}: {found}", flush=True)
+    print(f"{NAME}: {describe_progress(to)}")
+
+
+def run_one(run: Run, root: Path) -> dict:
+    """Do what is missing of a run; returns its score."""
+    folder = root / run.name
+    if (folder / SCORE).exists():
+        return load_json(folder / SCORE, kind="score")
+    first, second, tuned = (folder / stage for stage in STAGES)
+    configs, data = run.configs, root / f"seed{run.seed}"
+    with fixed_threads():
+        with locked(data, COLLECTING):
+            shared = configs["first"].replace(variant="frame")
+            train(shared, data, until="dataset")
+        train(configs["first"], first, data / "dataset")
+        train(configs["second"], second, earlier=first)
+        fine_tune(configs["tuned"], second, tuned)
+        copy_in_half(tuned, folder / "agent")
+        agent = load_agent(folder / "agent")
+        begin, limits = time.perf_counter(), {"max_frames": 1000}
+        score = drive_tracks(agent, TRACKS, processes=1, label=run.name, limits=limits)
+    seconds = time.perf_counter() - begin
+    save_json(
+        folder / SCORE, {"kind": "score", "variant": run.variant, **score, "seconds": seconds}
+    )
+    return score
+
+
+def describe_run(run: Run, root: Path) -> dict:
+    """The line of runs: score, validation by which agents are chosen, machine, seconds, budget."""
+    folder = root / run.name
+    score = load_json(folder / SCORE, kind="score")
+    returns = np.array([episode["return"] for episode in score["episodes"]])
+    records = {stage: load_json(folder / stage / RECORD) for stage in STAGES}
+    made, log = records["tuned"]["made_with"], load_json(folder / "tuned" / LOG)
+    line = {"mean": float(returns.mean()), "minimum": float(returns.min())}
+    line["below_800"] = float((returns < FAILED).mean())
+    line["validation"], line["generation"] = log["best"]["validation"], log["best"]["generation"]
+    line |= {name: made[name] for name in ("commit", "processor", "torch", "numpy")}
+    for stage, record in records.items():
+        line[f"seconds.{stage}"] = round(sum(record["seconds"].values()), 1)
+    line["seconds.score"] = round(score["seconds"], 1)
+    line |= total_budget(records["tuned"])
+    parameters = load_agent(folder / "agent").parameters
+    return line | {"controller": checksum_of_arrays(parameters=parameters)}
+
+
+def add_run(run: Run, root: Path, to: Path) -> None:
+    """Add a finished run to the tables, and keep its agent if it is the best of its variant.
+
+    Returns are rounded to cents.
+    """
+    score, key = load_json(root / run.name / SCORE, kind="score"), run._asdict()
+    returns = {str(one["track"]): round(one["return"], 2) for one in score["episodes"]}
+    line = key | describe_run(run, root)
+    with locked(to, WAIT):
+        before = tables.read_or_empty(f"{NAME}_runs", to)
+        others = before[before["variant"] == run.variant]["validation"]
+        if others.empty or line["validation"] > others.max():
+            kept = to.parent / NETWORKS.name / NAME / run.variant
+            copy_in_half(root / run.name / "agent", kept)
+        tables.replace_lines(f"{NAME}_returns", pandas.DataFrame([key | returns]), to)
+        tables.replace_lines(f"{NAME}_runs", pandas.DataFrame([line]), to)
+
+
+def recorded(run: Run, to: Path = tables.DATA) -> dict | None:
+    """The line of a run in the table of runs; None if it is not there."""
+    return tables.line_of(f"{NAME}_runs", run, to)
+
+
+def describe_progress(to: Path = tables.DATA) -> str:
+    """How many runs are in the tables."""
+    done = len(tables.read_or_empty(f"{NAME}_runs", to))
+    return f"{done} of {len(find_runs())} runs are done"

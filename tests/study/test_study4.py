@@ -1,0 +1,96 @@
+"""Study 4: whole runs of three stages, of which the best by validation is kept."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from stad_lab.agent import load_agent
+from stad_lab.config import VARIANTS, Config
+from stad_lab.io.files import load_json
+from stad_lab.training.fine_tuning import FINE_TUNING
+from stad_study import study4, tables
+from stad_study.cli import main
+from stad_study.experiments import EXPERIMENTS
+from stad_study.study4 import Run, add_run, find_runs, run_study4
+
+BRIEF = {"generations": 2, "validate_every": 1, "max_frames": 20}
+FIRST = Config.preset("quick", vae={"steps": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)
+FIRST = FIRST.replace(variant="frame", data={"crop_bar": False})
+SECOND = FIRST.replace(data={"agent_episodes": 2})
+TUNED = SECOND.replace(evolution={"generations": 2, "population": 4, "tracks": 2, "sigma": 0.02})
+RUN = Run(400, "frame")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def brief():
+    """The study with stages and scores of seconds."""
+    two, tuned = EXPERIMENTS["two_iterations_frame"], EXPERIMENTS["fine_tuned_frame"]
+    with pytest.MonkeyPatch.context() as patch:
+        first = dataclasses.replace(two, first=FIRST, config=SECOND)
+        patch.setitem(EXPERIMENTS, "two_iterations_frame", first)
+        patch.setitem(EXPERIMENTS, "fine_tuned_frame", dataclasses.replace(tuned, config=TUNED))
+        patch.setattr(study4, "VALIDATION", 2)
+        patch.setattr(study4, "TRACKS", range(6000, 6003))
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a finished run and its tables."""
+    folder = tmp_path_factory.mktemp("study4")
+    run_study4(folder, only=[RUN.name], to=folder / "data")
+    return folder
+
+
+def test_a_run_is_two_iterations_and_a_fine_tuning_with_the_indicator_bar():
+    configs = Run(401, "input_output").configs
+    assert list(configs) == ["first", "second", "tuned"]
+    assert {(one.variant, one.seed, one.evolution.seed) for one in configs.values()} == {
+        ("input_output", 401, 401)
+    }
+    assert not any(one.data.crop_bar for one in configs.values())
+    assert [one.data.agent_episodes for one in configs.values()] == [0, 110, 110]
+    assert configs["tuned"].evolution.tracks == FINE_TUNING["evolution"]["tracks"]
+    names = [run.name for run in find_runs()]
+    assert len(names) == 12 and names[:4] == [f"seed400/{one}" for one in VARIANTS]
+
+
+def test_the_score_is_of_the_agent_as_it_is_kept(made):
+    line = study4.recorded(RUN, made / "data")
+    returns = tables.read("study4_returns", made / "data").set_index(tables.AGENT).loc[tuple(RUN)]
+    assert list(returns.index) == ["6000", "6001", "6002"]
+    assert line["mean"] == pytest.approx(returns.mean(), abs=0.01)
+    kept, run = load_agent(made / "networks/study4/frame"), made / "study4" / RUN.name
+    assert np.array_equal(kept.parameters, load_agent(run / "agent").parameters)
+    assert line["validation"] == load_json(run / "tuned/evolution.json")["best"]["validation"]
+    assert line["agents"] == 3 * 2 * 4
+
+
+def test_a_recorded_run_is_repeated_in_an_empty_folder_alone(made, tmp_path, capsys):
+    with pytest.raises(ValueError, match="has the recorded run: give an empty folder"):
+        run_study4(made, only=[RUN.name], to=made / "data")
+    run_study4(tmp_path, only=[RUN.name], to=made / "data")
+    mean = study4.recorded(RUN, made / "data")["mean"]
+    assert f"mean return {mean:.1f}, recorded {mean:.1f}" in capsys.readouterr().out
+
+
+def test_of_a_variant_the_agent_with_the_best_validation_is_kept(made, tmp_path):
+    table = tables.read("study4_runs", made / "data")
+    kept = tmp_path / "networks/study4/frame/controller.safetensors"
+    for change, is_kept in ((-1.0, True), (1.0, False)):
+        other = table.assign(seed=401, validation=table["validation"] + change)
+        tables.save("study4_runs", other, tmp_path / "data")
+        kept.unlink(missing_ok=True)
+        add_run(RUN, made / "study4", tmp_path / "data")
+        assert kept.exists() == is_kept
+        assert len(tables.read("study4_runs", tmp_path / "data")) == 2
+
+
+def test_bad_names_and_options_are_refused_in_one_line(tmp_path, capsys):
+    for options, expected in (
+        (["--only", "seed7/frame"], "study 'study4' has no run 'seed7/frame'"),
+        (["--keep"], "study4 takes neither --keep nor --scheduler"),
+    ):
+        assert main(["replicate", "study4", "--out", str(tmp_path), *options]) == 2
+        assert expected in capsys.readouterr().err
