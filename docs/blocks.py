@@ -168,6 +168,20 @@ def repeated_table(study: dict, first: dict) -> str:
     return table(("mean of the seeds", *SEEN.values()), lines)
 
 
+def strongest(claims: dict) -> str:
+    """Study 4: how many runs are done; after the last the agent of each variant."""
+    study = claims["study4"]
+    if "agents" not in study:
+        return f"Runs done: {study['runs']} of {study['planned']}."
+    lines = []
+    for variant, one in study["agents"].items():
+        scores = ", ".join(f"{score:.1f}" for score in one["scores"])
+        cells = (f"`{variant}`", scores, f"{one['mean']:.1f}", f"{one['minimum']:.0f}")
+        lines.append((*cells, str(one["failures"]), "yes" if one["reached"] else "no"))
+    head = ("variant", "three seeds", "chosen agent", "minimum", "below 800", "goal reached")
+    return table(head, lines)
+
+
 def outcomes(claims: dict) -> str:
     """The secondary outcomes of study 1, the score of every pipeline, and the learning curves."""
     figures = [image(name, claims) for name in ("study1_scores", "study1_curves")]
@@ -535,6 +549,7 @@ BLOCKS: dict[str, Callable[[dict], str]] = {
     "afterwards": afterwards,
     "outcomes": outcomes,
     "cause": cause,
+    "strongest": strongest,
     "faster recipe": faster_recipe,
     "turning": turning_table,
     "study3, agent": lambda claims: study3(claims, "agent"),

@@ -17,6 +17,7 @@ from stad_lab.training.record import total_budget
 from stad_study import (
     measurements,
     study2_claims,
+    study4_claims,
     study5_claims,
     study6_claims,
     study_claims,
@@ -38,6 +39,7 @@ def compute_claims() -> dict[str, dict]:
         "study1": study_claims.describe_study1(),
         "study2": study2_claims.describe_study2(),
         "study3": study_claims.describe_study3(),
+        "study4": study4_claims.describe_study4(),
         "study5": study5_claims.describe_study5(),
         "study6": study6_claims.describe_study6(),
         "studies1_and_6": study6_claims.compare_with_study1(),
