@@ -152,7 +152,7 @@ def do_run(
         print(f"{run.name}: {describe_progress(study, to)}", flush=True)
         score = run_one(study, run, root, networks, repeat=was is not None)
         if was:
-            print(f"{run.name}: {compare(run, was, root)}", flush=True)
+            print(f"{run.name}: {compare_run(run, was, root)}", flush=True)
             return
         add_run(study, run, root, to)
         print(f"{run.name}: mean return {score['mean']:.1f}", flush=True)
@@ -211,7 +211,7 @@ def add_run(study: Evolved, run: EvolvedRun, root: Path, to: Path) -> None:
     line = pandas.DataFrame([key | describe_run(run, root)])
     networks = to.parent / NETWORKS.name / study.name
     with locked(to, WAIT):
-        keep_controller(study, run, np.array(score["controller"]), networks)
+        add_controller(study, run, np.array(score["controller"]), networks)
         tables.replace_lines(f"{study.name}_returns", pandas.DataFrame([key | returns]), to)
         tables.replace_lines(f"{study.name}_runs", line, to)
 
@@ -234,7 +234,7 @@ def describe_run(run: EvolvedRun, root: Path) -> dict:
     return line | {"returns": checksum_of_arrays(returns=returns)}
 
 
-def keep_controller(study: Evolved, run: EvolvedRun, controller: np.ndarray, folder: Path) -> None:
+def add_controller(study: Evolved, run: EvolvedRun, controller: np.ndarray, folder: Path) -> None:
     """Add a C to the file of its seed: float16 (parameters,) under the name of the run."""
     path = folder / f"seed{run.seed}.safetensors"
     tensors = load_tensors(path)[0] if path.exists() else {}
@@ -247,7 +247,7 @@ def recorded(study: Evolved, run: EvolvedRun, to: Path = tables.DATA) -> dict | 
     return tables.line_of(f"{study.name}_runs", tuple(run._asdict().values()), to)
 
 
-def compare(run: EvolvedRun, was: dict, root: Path) -> str:
+def compare_run(run: EvolvedRun, was: dict, root: Path) -> str:
     """Whether a run that was repeated is, bit by bit, the one in the tables."""
     now = describe_run(run, root)
     differs = [name for name in CHECKSUMS if was[name] != now[name]]

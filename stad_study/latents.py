@@ -173,14 +173,14 @@ def mdn_rnn_part(given: Given) -> dict:
             nll |= reduced_predictions(given, model, z, actions)
         result["variants"][variant] = {
             "active": int(active.sum()),
-            "nll": compare(nll, active),
+            "nll": compare_nll(nll, active),
             "pit": (counts / counts.sum()).tolist(),
             "horizon": metrics.horizon_errors(model.vae, dreamed, some, AWAKE, HORIZON),
         }
     return result
 
 
-def compare(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
+def compare_nll(nll: dict[str, np.ndarray], active: np.ndarray) -> dict:
     """Predictions beside M: name -> mean nats, its interval, and that of the difference to M.
 
     Their nll (trajectories, frames, latent_size) counts on the second half of the trajectories, as

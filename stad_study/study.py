@@ -187,7 +187,7 @@ def run_study(
                 print(f"{pipeline.name}: {describe_progress(study, wanted, to)}", flush=True)
                 run_pipeline(pipeline, root, executor)
                 if only and recorded(pipeline, to):
-                    found = compare(pipeline, root, to)
+                    found = compare_pipeline(pipeline, root, to)
                 else:
                     add_pipeline(pipeline, root, to)
                     found = describe_score(pipeline, root)
@@ -387,7 +387,7 @@ def describe_run(pipeline: Pipeline, root: Path) -> dict:
 CHECKSUMS = ("dataset", "vae", "mdn_rnn", "log", "kept_world_model", "kept_controller")
 
 
-def compare(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> str:
+def compare_pipeline(pipeline: Pipeline, root: Path, to: Path = tables.DATA) -> str:
     """Whether a pipeline that was run again is, bit by bit, the one in the tables."""
     was, now = recorded(pipeline, to) or {}, describe_run(pipeline, root)
     table = tables.read_study("episodes", to)

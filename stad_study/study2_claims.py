@@ -12,7 +12,7 @@ import numpy as np
 from stad_study import tables
 from stad_study.evolved import describe_counts
 from stad_study.study2 import GATE, SEEDS, STUDY2, has_passed
-from stad_study.study_claims import compare
+from stad_study.study_claims import compare_arms
 
 
 def describe_study2(folder: Path = tables.DATA) -> dict:
@@ -41,7 +41,7 @@ def describe_study2(folder: Path = tables.DATA) -> dict:
     }
     if passed := [episodes for episodes in (1, 4) if gates[episodes]]:
         pair = [returns_of(variant, passed[0], folder) for variant in ("frame", "input_output")]
-        found["comparison"] = compare(*pair) | {"episodes": passed[0]}
+        found["comparison"] = compare_arms(*pair) | {"episodes": passed[0]}
     return found
 
 

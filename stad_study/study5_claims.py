@@ -15,7 +15,7 @@ from stad_study import tables
 from stad_study.evolved import describe_counts
 from stad_study.study import STUDIES
 from stad_study.study5 import ARMS, REPEATS, STUDY5
-from stad_study.study_claims import compare, find_verdict, mean_curve
+from stad_study.study_claims import compare_arms, find_verdict, mean_curve
 
 RELEVANT = "relevant difference"  # some arms lead, others trail
 Families = dict[tuple[str, ...], dict[str, tuple[dict[str, float], ...]]]
@@ -124,7 +124,7 @@ def compare_family(scores: dict[str, np.ndarray], comparisons: dict, tested: boo
         added, subtracted = (
             sum(weight * scores[arm] for arm, weight in side.items()) for side in sides
         )
-        found[name] = compare(subtracted, added)
+        found[name] = compare_arms(subtracted, added)
         if not tested:
             del found[name]["p"]
     if tested:

@@ -12,7 +12,7 @@ from stad_lab.evaluation.statistics import mean_interval
 from stad_lab.training.pipeline import STAGES
 from stad_study import tables
 from stad_study.study import STUDIES, check_settings
-from stad_study.study_claims import MARGIN, compare, describe_progress, returns_of_study
+from stad_study.study_claims import MARGIN, compare_arms, describe_progress, returns_of_study
 
 RECIPES = "study6_laptop", "study6_fast"
 
@@ -59,7 +59,7 @@ def compare_with_study1(folder: Path = tables.DATA) -> dict:
     """
     both = [returns_of_study(name, folder) for name in ("study1", RECIPES[0])]
     arms = ("z, h: frame", "z, h: input_output")
-    return compare(*(np.concatenate([returns[arm] for returns in both]) for arm in arms))
+    return compare_arms(*(np.concatenate([returns[arm] for returns in both]) for arm in arms))
 
 
 def minutes_of(runs: pandas.DataFrame) -> float:

@@ -88,7 +88,7 @@ def compare_family(
     for features in FEATURES:
         for variant in variants:
             arms = f"{features}: frame", f"{features}: {variant}"
-            found[arms[1]] = compare(*(returns[arm] for arm in arms))
+            found[arms[1]] = compare_arms(*(returns[arm] for arm in arms))
             faster = areas[arms[1]] - areas[arms[0]]
             found[arms[1]]["area_difference"] = float(faster.mean())
             found[arms[1]]["area_interval"] = statistics.bootstrap(faster[:, None])
@@ -103,7 +103,7 @@ def compare_family(
     return found
 
 
-def compare(frame: np.ndarray, variant: np.ndarray) -> dict:
+def compare_arms(frame: np.ndarray, variant: np.ndarray) -> dict:
     """The difference of two arms (seeds, tracks) on the same seeds and tracks.
 
     "interval" is of the bootstrap, "t_interval" Student's over seeds.
@@ -122,15 +122,15 @@ def compare(frame: np.ndarray, variant: np.ndarray) -> dict:
 def compare_afterwards(returns: dict[str, np.ndarray]) -> dict[str, dict]:
     """Comparisons that the protocol of study 1 does not have, computed after its results."""
     gain = {one: returns[f"{one}: input_output"] - returns[f"{one}: frame"] for one in FEATURES}
-    found = {"interaction": compare(gain["z, h"], gain["z"])}
+    found = {"interaction": compare_arms(gain["z, h"], gain["z"])}
     for features in FEATURES:
         pair = (returns[f"{features}: {variant}"] for variant in ("input", "input_output"))
-        found[f"{features}: input_output less input"] = compare(*pair)
+        found[f"{features}: input_output less input"] = compare_arms(*pair)
     both = (
         np.mean([returns[f"{one}: {variant}"] for one in FEATURES], axis=0)
         for variant in ("input", "input_output")
     )
-    return found | {"input_output less input": compare(*both)}
+    return found | {"input_output less input": compare_arms(*both)}
 
 
 def primary_gains(returns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

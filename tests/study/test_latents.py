@@ -23,7 +23,7 @@ from stad_study.latents import (
     HORIZON,
     REDUCED,
     Given,
-    compare,
+    compare_nll,
     measure,
     reduced_predictions,
     simple_predictions,
@@ -188,7 +188,7 @@ def test_predictions_are_compared_on_the_same_frames_and_on_active_latents():
     nll[:, :3] = 100  # frames that a prediction from the last four z lacks
     nll[..., 2] = 50  # an inactive latent
     nll[:3] = -7  # trajectories that the simple predictions were fitted on
-    found = compare({"M": nll, "longer": nll[:, 3:] + 0.5}, np.array([True, True, False]))
+    found = compare_nll({"M": nll, "longer": nll[:, 3:] + 0.5}, np.array([True, True, False]))
     assert found["M"]["nats"] == 1 and found["longer"]["nats"] == 1.5
     assert found["longer"]["more_than_M"] == [0.5, 0.5] and found["M"]["more_than_M"] == [0, 0]
 

@@ -194,7 +194,9 @@ def test_a_pipeline_repeated_by_name_is_bit_identical(made, tmp_path, capsys, mo
     other["return"] += 0.1
     shutil.copytree(made / "data", tmp_path / "data")
     tables.save("study_episodes", other, tmp_path / "data")
-    found = study.compare(find_pipelines("tiny", [0])[2], tmp_path / "tiny", tmp_path / "data")
+    found = study.compare_pipeline(
+        find_pipelines("tiny", [0])[2], tmp_path / "tiny", tmp_path / "data"
+    )
     assert found.startswith("differs in 18 of 18 returns; recorded on ")
 
 

@@ -22,7 +22,7 @@ from stad_lab.training.evolution import LOG
 from stad_lab.training.trainer import torch_settings
 from stad_study import senses, study5, tables, world_facts
 from stad_study.cli import main
-from stad_study.evolved import compare, find_runs, recorded, run_evolved
+from stad_study.evolved import compare_run, find_runs, recorded, run_evolved
 from stad_study.networks import WORLD_MODEL_FILE, keep_world_model, load_kept_world_model
 from stad_study.senses import (
     COLUMNS,
@@ -115,7 +115,7 @@ def test_a_repeated_run_is_compared_with_the_recorded_one(made, networks, tmp_pa
         run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
     (run,) = find_runs(STUDY5, only=only)
     was = recorded(STUDY5, run, made / "data") | {"returns": "other"}
-    assert compare(run, was, tmp_path / "study5").startswith("differs in returns: mean ")
+    assert compare_run(run, was, tmp_path / "study5").startswith("differs in returns: mean ")
 
 
 def test_c_that_sees_z_alone_drives_as_the_agent_does(made, networks):
