@@ -37,6 +37,7 @@ from stad_study.verdict import (
     PAPER_GAIN,
     describe_cause,
     describe_interaction,
+    describe_repetition,
     describe_verdict,
 )
 
@@ -74,15 +75,22 @@ def paper_table(claims: dict) -> str:
 
 def finding(claims: dict) -> str:
     """The finding of the replication, for the overview: both verdicts, and whether they differ."""
-    return " ".join(describe_verdict(claims["study1"])[:3])
+    return " ".join([*describe_verdict(claims["study1"])[:2], difference_of_effects(claims)])
+
+
+def difference_of_effects(claims: dict) -> str:
+    """Whether the two effects differ: in part 5a of study 5 once it is known, else in study 1."""
+    if repeated := claims["study5"]["comparisons"]:
+        return describe_repetition(repeated["interaction"])
+    return describe_interaction(claims["study1"]["afterwards"]["interaction"])
 
 
 def verdict(claims: dict) -> str:
     """The verdict of study 1, a line for each sentence; and once it is known, that of part 5a."""
     told = describe_verdict(claims["study1"])
     if claims["study5"]["comparisons"]:
-        first, *_ = describe_cause(claims["study5"])
-        told.insert(3, f"[Repeated](#is-it-the-motion) with three C for each V and M: {first}")
+        sentence = difference_of_effects(claims).removesuffix(".")
+        told.insert(3, f"{sentence} ([study 5a](#is-it-the-motion)).")
     return "\n".join(f"- {sentence}" for sentence in told)
 
 
@@ -94,11 +102,10 @@ def gains(claims: dict) -> str:
         points = f"{one['difference'] + 0.0:.0f} points".replace("-0 ", "0 ")
         told.append(f"*{one['verdict']}* ({points})")
     both, alone = told
-    differ = describe_interaction(study["afterwards"]["interaction"])
     text = (
         "Does it help to see and reconstruct what has moved? A paper says so. In our study of"
         f" twelve pairs, if the controller sees the memory, as it probably does there: {both}."
-        f" If it does not: {alone}. {differ}"
+        f" If it does not: {alone}. {difference_of_effects(claims)}"
     )
     return text
 

@@ -31,17 +31,17 @@ def compare_pictures(number: int, frames: int = MAX_FRAMES) -> tuple[np.ndarray,
     if number % 2:
         start = int(rng.integers(10_000)), rng.uniform(0, 90), 0.15 * rng.standard_normal()
         seen = [place_car(env, *start) for env in envs]
-    errors = [compare_pictures(fast.cars, *seen)]
+    errors = [measure_differences(fast.cars, *seen)]
     while len(errors) <= frames and not ended:
         action = driver.act()
         steps = [env.step(action) for env in envs]
         equal &= steps[0][1:] == steps[1][1:]
         ended = any(step[2] or step[3] for step in steps)
-        errors.append(compare_pictures(fast.cars, steps[0][0], steps[1][0]))
+        errors.append(measure_differences(fast.cars, steps[0][0], steps[1][0]))
     return np.array(errors), equal
 
 
-def compare_pictures(cars: Cars, ours: np.ndarray, theirs: np.ndarray) -> list[float]:
+def measure_differences(cars: Cars, ours: np.ndarray, theirs: np.ndarray) -> list[float]:
     """Differences between observations of a car, and from its frames, in the order of AREAS."""
     places = (..., CAR_WINDOW, slice(BAR_TOP, None))
     pairs = [(ours[place], theirs[place]) for place in places]

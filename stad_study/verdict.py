@@ -57,6 +57,15 @@ def describe_interaction(one: dict) -> str:
     return f"{text} which is {significant} (p = {one['p']:.3f})."
 
 
+def describe_repetition(one: dict) -> str:
+    """Whether the two effects differ in part 5a of study 5, whose interaction this is."""
+    significant = "significant" if one["verdict"] in ("gain", "harm") else "not significant"
+    text = "With each controller evolved three times, on the same V, M and tracks, the two"
+    text += f" differences are {one['difference']:.1f} points apart"
+    text += " (95% interval {:.1f} to {:.1f}),".format(*one["interval"])
+    return f"{text} which is {significant} (p = {one['holm_p']:.3f})."
+
+
 def describe_others(comparisons: dict[str, dict]) -> str:
     """How many of the differences of `input` and `output` are a gain or a harm."""
     others = [one for name, one in comparisons.items() if not name.endswith(": input_output")]

@@ -115,6 +115,19 @@ def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_f
     assert "Shown: nothing." in reading
 
 
+@pytest.mark.parametrize(
+    ("interval", "words"),
+    [([5.0, 60.0], "which is significant (p = 0.010)"), ([-9.0, 60.0], "not significant")],
+)
+def test_whether_the_two_effects_differ_is_told_from_study_5_once_it_is_known(interval, words):
+    study = study_with(("no relevant gain", "gain"))
+    claims = {"study1": study, "study5": {"comparisons": {}}}
+    assert "p = 0.075" in blocks.finding(claims)
+    claims["study5"] = cause_with({"interaction": interval})
+    assert words in blocks.finding(claims) and "p = 0.075" not in blocks.finding(claims)
+    assert words in blocks.verdict(claims) and "p = 0.075" in blocks.verdict(claims)
+
+
 def test_half_of_study_5_has_its_verdicts_but_no_reading():
     study = cause_with()
     kept = ("interaction", "input_output less input")
