@@ -59,11 +59,10 @@ def describe_interaction(one: dict) -> str:
 
 def describe_repetition(one: dict) -> str:
     """Whether the two effects differ in part 5a of study 5, whose interaction this is."""
-    significant = "significant" if one["verdict"] in ("gain", "harm") else "not significant"
-    text = "With each controller evolved three times, on the same V, M and tracks, the two"
-    text += f" differences are {one['difference']:.1f} points apart"
-    text += " (95% interval {:.1f} to {:.1f}),".format(*one["interval"])
-    return f"{text} which is {significant} (p = {one['holm_p']:.3f})."
+    differ = "differ" if one["verdict"] in ("gain", "harm") else "do not differ"
+    text = f"With each controller evolved three times, the two {differ} significantly:"
+    (low, high), points = one["interval"], f"by {one['difference']:.1f}"
+    return f"{text} {points} ({low:.1f} to {high:.1f}; p = {one['holm_p']:.3f})."
 
 
 def describe_others(comparisons: dict[str, dict]) -> str:

@@ -118,7 +118,7 @@ def test_the_page_shows_the_tests_of_complete_parts_alone(described, tmp_path, m
     claims = {"study5": study, "study1": read_claims()["study1"]}
     page = blocks.cause(claims)
     lines = [line for line in page.splitlines() if line.startswith("| `")]
-    assert ("[Repeated](#is-it-the-motion)" in blocks.verdict(claims)) == (rows > 0)
+    assert ("(#is-it-the-motion)" in blocks.verdict(claims)) == (rows > 0)
     assert len(lines) == rows and ("../notebooks/pictures/study5.png" in page) == (rows > 0)
     assert f"5c {max(0, 144 - missing)} of 144" in page
     assert ("study5" in blocks.drawable(claims)) == (rows > 0)
