@@ -89,7 +89,7 @@ def verdict(claims: dict) -> str:
     """The verdict of study 1, a line for each sentence; and once it is known, that of part 5a."""
     told = describe_verdict(claims["study1"])
     if claims["study5"]["comparisons"]:
-        source = "That is [study 5a](#is-it-the-motion), on the same V, M and tracks."
+        source = "That is [study 5a](#is-it-the-motion), with the V, M and tracks of study 1."
         told.insert(3, f"{difference_of_effects(claims)} {source}")
     return "\n".join(f"- {sentence}" for sentence in told)
 

@@ -109,7 +109,7 @@ def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
     axis.set_xlabel("difference, points")
     legend_below(figure, axis)
     told = [f"{title} {difference_of(one)}" for title, one in rows.items()]
-    return describe(figure, "Study 5: is it the motion?", "Means: ", ["; ".join(told)])
+    return describe(figure, "Study 5: each C evolved three times", "Means: ", ["; ".join(told)])
 
 
 def plot_scores(arms: dict[str, dict]) -> Figure:

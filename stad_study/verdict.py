@@ -59,10 +59,10 @@ def describe_interaction(one: dict) -> str:
 
 def describe_repetition(one: dict) -> str:
     """Whether the two effects differ in part 5a of study 5, whose interaction this is."""
-    differ = "differ" if one["verdict"] in ("gain", "harm") else "do not differ"
-    text = f"With each controller evolved three times, the two {differ} significantly:"
-    (low, high), points = one["interval"], f"by {one['difference']:.1f}"
-    return f"{text} {points} ({low:.1f} to {high:.1f}; p = {one['holm_p']:.3f})."
+    (low, high), points = one["interval"], one["difference"]
+    larger = f"{'larger' if points > 0 else 'smaller'} by {abs(points):.1f} points"
+    text = f"With three evolutions each, the second is {larger}"
+    return f"{text} ({low:.1f} to {high:.1f}; Holm's p = {one['holm_p']:.3f})."
 
 
 def describe_others(comparisons: dict[str, dict]) -> str:
