@@ -19,7 +19,6 @@ def ship(folder: str | Path, name: str) -> Path:
     is the shipped agent itself; and as `copy_in_half`.
     """
     folder, target = Path(folder), PRETRAINED / name
-    load_vae(folder / VAE_FILE)
     if target.resolve() == folder.resolve() or not name.isidentifier():
         expected = "a new name of letters, digits and _, and another folder"
         raise ValueError(f"name={name!r}, folder={folder}: expected {expected}")

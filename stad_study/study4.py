@@ -37,6 +37,7 @@ from stad_study.ship import copy_in_half
 from stad_study.study import (
     COLLECTING,
     SCORE,
+    STUDIES,
     WAIT,
     drive_tracks,
     fixed_threads,
@@ -131,7 +132,7 @@ def run_one(run: Run, root: Path) -> dict:
         fine_tune(configs["tuned"], second, tuned)
         copy_in_half(tuned, folder / "agent")
         agent = load_agent(folder / "agent")
-        begin, limits = time.perf_counter(), {"max_frames": 1000}
+        begin, limits = time.perf_counter(), {"max_frames": STUDIES["study1"].max_frames}
         score = drive_tracks(agent, TRACKS, processes=1, label=run.name, limits=limits)
     seconds = time.perf_counter() - begin
     save_json(
