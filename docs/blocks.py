@@ -102,12 +102,11 @@ def gains(claims: dict) -> str:
         points = f"{one['difference'] + 0.0:.0f} points".replace("-0 ", "0 ")
         told.append(f"*{one['verdict']}* ({points})")
     both, alone = told
-    text = (
-        "Does it help to see and reconstruct what has moved? A paper says so. In our study of"
-        f" twelve pairs, if the controller sees the memory, as it probably does there: {both}."
-        f" If it does not: {alone}. {difference_of_effects(claims)}"
+    return (
+        "Does it help to see and reconstruct what has moved? A paper says so. We trained twelve"
+        f" pairs. With a memory, as the paper's controller probably has it: {both}. Without:"
+        f" {alone}. {difference_of_effects(claims)}"
     )
-    return text
 
 
 def verdict_figure(claims: dict) -> str:

@@ -5,7 +5,6 @@ folder of its own name, with the log of CMA-ES and the score. Whatever is there 
 finished run is added to the tables, and its C to `networks` beside them.
 """
 
-import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -38,6 +37,7 @@ from stad_study.study import (
     STUDIES,
     WAIT,
     Run,
+    claimed,
     fixed_threads,
     groups_of,
     refuse_finished,
@@ -141,13 +141,9 @@ def do_run(
     """Run and add what is not in the tables; with `repeat` run what is there, too, and compare."""
     if recorded(study, run, to) and not repeat:
         return
-    with contextlib.ExitStack() as stack:
-        try:
-            stack.enter_context(locked(root / run.name))
-        except BlockingIOError:
-            return
+    with claimed(root / run.name) as ours:
         was = recorded(study, run, to)
-        if was and not repeat:  # another process has just finished it
+        if not ours or (was and not repeat):  # another process has just finished it
             return
         print(f"{run.name}: {describe_progress(study, to)}", flush=True)
         score = run_one(study, run, root, networks, repeat=was is not None)

@@ -176,14 +176,9 @@ def run_study(
         own = [one for one in wanted if (one.seed, one.variant) == (seed, variant)]
         if not only and not unfinished(own, to):
             continue
-        with contextlib.ExitStack() as stack:
-            try:
-                stack.enter_context(locked(root / f"seed{seed}" / variant))
-            except BlockingIOError:
-                print(f"seed{seed}/{variant}: is run by another process", flush=True)
-                continue
+        with claimed(root / f"seed{seed}" / variant) as ours:
             # Asked again, because another process may have finished them just before.
-            for pipeline in own if only else unfinished(own, to):
+            for pipeline in (own if only else unfinished(own, to)) if ours else ():
                 print(f"{pipeline.name}: {describe_progress(study, wanted, to)}", flush=True)
                 run_pipeline(pipeline, root, executor)
                 if only and recorded(pipeline, to):
@@ -193,6 +188,19 @@ def run_study(
                     found = describe_score(pipeline, root)
                 print(f"{pipeline.name}: {found}", flush=True)
     print(f"{study}: {describe_progress(study, wanted, to)}")
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[bool]:
+    """Own the folder of a run for a `with` block; False if another process has it."""
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.enter_context(locked(folder))
+            ours = True
+        except BlockingIOError:
+            ours = False
+            print(f"{folder}: is run by another process", flush=True)
+        yield ours
 
 
 def refuse_finished(folder: Path) -> None:

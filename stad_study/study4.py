@@ -13,7 +13,6 @@ Whatever is there is not done again. A finished run is added to the tables. Of e
 agent with the best validation is kept in `networks/study4`, to be shipped.
 """
 
-import contextlib
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,6 +25,7 @@ from stad_lab.agent import load_agent
 from stad_lab.config import VARIANTS, Config
 from stad_lab.evaluation.statistics import FAILED
 from stad_lab.io.files import checksum_of_arrays, load_json, locked, save_json
+from stad_lab.io.weights import CONTROLLER_FILE, load_controller
 from stad_lab.training.evolution import LOG
 from stad_lab.training.fine_tuning import fine_tune
 from stad_lab.training.pipeline import train
@@ -39,6 +39,7 @@ from stad_study.study import (
     SCORE,
     STUDIES,
     WAIT,
+    claimed,
     drive_tracks,
     fixed_threads,
     refuse_finished,
@@ -97,13 +98,9 @@ def run_study4(
         if recorded(run, to):
             refuse_finished(root / run.name)
     for run in wanted:
-        with contextlib.ExitStack() as stack:
-            try:
-                stack.enter_context(locked(root / run.name))
-            except BlockingIOError:
-                continue
+        with claimed(root / run.name) as ours:
             was = recorded(run, to)
-            if was and not only:
+            if not ours or (was and not only):
                 continue
             print(f"{run.name}: {describe_progress(to)}", flush=True)
             score = run_one(run, root)
@@ -141,10 +138,8 @@ def run_one(run: Run, root: Path) -> dict:
     return score
 
 
-def describe_run(run: Run, root: Path) -> dict:
+def describe_run(folder: Path, score: dict) -> dict:
     """The line of runs: score, validation by which agents are chosen, machine, seconds, budget."""
-    folder = root / run.name
-    score = load_json(folder / SCORE, kind="score")
     returns = np.array([episode["return"] for episode in score["episodes"]])
     records = {stage: load_json(folder / stage / RECORD) for stage in STAGES}
     made, log = records["tuned"]["made_with"], load_json(folder / "tuned" / LOG)
@@ -156,7 +151,7 @@ def describe_run(run: Run, root: Path) -> dict:
         line[f"seconds.{stage}"] = round(sum(record["seconds"].values()), 1)
     line["seconds.score"] = round(score["seconds"], 1)
     line |= total_budget(records["tuned"])
-    parameters = load_agent(folder / "agent").parameters
+    parameters, _ = load_controller(folder / "agent" / CONTROLLER_FILE)
     return line | {"controller": checksum_of_arrays(parameters=parameters)}
 
 
@@ -167,7 +162,7 @@ def add_run(run: Run, root: Path, to: Path) -> None:
     """
     score, key = load_json(root / run.name / SCORE, kind="score"), run._asdict()
     returns = {str(one["track"]): round(one["return"], 2) for one in score["episodes"]}
-    line = key | describe_run(run, root)
+    line = key | describe_run(root / run.name, score)
     with locked(to, WAIT):
         before = tables.read_or_empty(f"{NAME}_runs", to)
         others = before[before["variant"] == run.variant]["validation"]

@@ -59,9 +59,8 @@ def describe_interaction(one: dict) -> str:
 
 def describe_repetition(one: dict) -> str:
     """Whether the two effects differ in part 5a of study 5, whose interaction this is."""
-    (low, high), points = one["interval"], one["difference"]
-    larger = f"{'larger' if points > 0 else 'smaller'} by {abs(points):.1f} points"
-    text = f"With three evolutions each, the second is {larger}"
+    low, high = one["interval"]
+    text = f"Repeated with three controllers each, the two differ by {one['difference']:.1f} points"
     return f"{text} ({low:.1f} to {high:.1f}; Holm's p = {one['holm_p']:.3f})."
 
 
