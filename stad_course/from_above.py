@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from stad_lab.agent import Agent, rollout
 from stad_lab.envs.cars import Cars
@@ -19,12 +20,12 @@ from stad_lab.training.evolution import make_agent
 from stad_lab.viz.plots import (
     BLUE,
     ORANGE,
-    STYLES,
     THIN,
     caption,
     describe,
     legend_below,
     new_figure,
+    styles_of,
 )
 
 THREADS = 2  # that share the cars; the results do not depend on it
@@ -176,7 +177,7 @@ def plot_road(
     left, right = road_edges(road)
     for axis in axes[0]:
         axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85", label="road")
-        for (name, path), (color, dash) in zip(paths.items(), STYLES, strict=False):
+        for (name, path), (color, dash) in zip(paths.items(), styles_of(paths), strict=False):
             axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
             axis.plot(*path[-1], "x", color=color, ms=7)
             for tail, head in zip(path[:-5:ARROWS], path[5::ARROWS], strict=False):
@@ -186,6 +187,8 @@ def plot_road(
         axis.set(xlabel="world units", aspect="equal")
     axes[0, 0].set(ylabel="world units", title="the lap (triangle: start, x: end)")
     (x, y), far = road[center], np.array([-reach, reach])
+    enlarged = Rectangle((x - reach, y - reach), 2 * reach, 2 * reach, fill=False, ls=":")
+    axes[0, 0].add_patch(enlarged)
     axes[0, 1].set(xlim=x + far, ylim=y + far, title=f"around tile {center}")
     axes[0, 1].legend(fontsize=8)
     lead = f"A lap of {len(road)} tiles from above, and enlarged around tile {center}: "

@@ -5,10 +5,9 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from stad_lab.config import VARIANTS
 from stad_lab.viz.plots import (
-    COLORS,
     DASHES,
+    VARIANT_STYLES,
     caption,
     describe,
     legend_below,
@@ -17,15 +16,15 @@ from stad_lab.viz.plots import (
     plot_intervals,
 )
 
-COLOURS = dict(zip(VARIANTS, COLORS, strict=False))  # those of the rows of `plot_returns`
+COLOURS = {variant: colour for variant, (colour, _) in VARIANT_STYLES.items()}
 SEEN = {"z, h": "C sees z and h", "z": "C sees z"}
 DRIVERS = {"agent": "an agent", "random_driver": "the random driver"}
 SOURCES = {"z": "z", "z, h": "z and h"}
 CAUSE = {  # the comparisons of study 5, in Markdown
-    "interaction": "`input_output` - `frame`: with z, minus the same with z and h",
-    "input_output less input": "`input_output` - `input`, mean of both C",
     "effect with z": "`input_output` - `frame`, C sees z",
     "effect with z and h": "`input_output` - `frame`, C sees z and h",
+    "interaction": "`input_output` - `frame`: with z, minus the same with z and h",
+    "input_output less input": "`input_output` - `input`, mean of both C",
     "adding motion": "`frame`: z + motion, minus z + placebo",
     "erasing motion": "`input_output`: z - motion, minus z - placebo",
     "both with motion": "`input_output` - `frame`, both with z + motion",

@@ -106,7 +106,9 @@ def describe_cause(study: dict) -> list[str]:
             one = comparisons[name]
             (low, high), points = one["interval"], f"{one['difference']:+.1f} points"
             points += f" (95% interval {low:.1f} to {high:.1f})"
-            told.append(f"With {change}, {what} changes by {points}: *{one['verdict']}*.")
+            told.append(f"With {change}, {what} changes by {points}: *{one['verdict']}*")
+            small = one["verdict"] == "gain" and high < MARGIN
+            told[-1] += f", but of fewer than {MARGIN} points." if small else "."
     if "interaction" in comparisons:
         told.append(read_repetition(comparisons["interaction"]["verdict"]))
     if set(CHANGED) <= set(comparisons):

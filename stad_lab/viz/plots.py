@@ -16,6 +16,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
+from stad_lab.config import VARIANTS
 from stad_lab.evaluation.statistics import SOLVED
 from stad_lab.evaluation.trajectories import MOTION
 
@@ -25,6 +26,7 @@ COLORS = (BLUE, ORANGE, GREEN, PURPLE, RED, SKY)
 DASHES = ("-", "--", "-.", ":")
 # Lines differ in more than colour: to colour-blind readers GREEN and PURPLE are two greys.
 STYLES = [(color, DASHES[(i + turn) % 4]) for turn in range(4) for i, color in enumerate(COLORS)]
+VARIANT_STYLES = dict(zip(VARIANTS, STYLES, strict=False))
 MARKERS = "os^DvP"
 DIFFERENCE_MAP = "PuOr_r"
 THIN = {"color": "grey", "lw": 0.8, "ls": ":"}  # a line for reference
@@ -44,6 +46,13 @@ def describe(figure: Figure, title: str, lead: str, values: Iterable[str] = ()) 
     figure.suptitle(title, fontsize=11)
     figure.set_label(f"{title}. {lead}{', '.join(values)}.")
     return figure
+
+
+def styles_of(names: Iterable[str]) -> Iterable[tuple[str, str]]:
+    """Colour and dash of each line; a variant has its own if all names are variants."""
+    names = list(names)
+    own = set(names) <= set(VARIANT_STYLES)
+    return [VARIANT_STYLES[name] for name in names] if own else cycle(STYLES)
 
 
 def draw_picture(axis: Axes, picture: np.ndarray, **scale) -> AxesImage:
@@ -220,7 +229,8 @@ def plot_curves(
     """
     many = len(curves) > 4  # then the names stand beside the lines
     figure, ((axis,),) = new_figure(7.5 if many else 6.5, 3.2)
-    styles = zip(curves.items(), cycle(STYLES), cycle(MARKERS if many and marker else [marker]))
+    shapes = cycle(MARKERS if many and marker else [marker])
+    styles = zip(curves.items(), styles_of(curves), shapes, strict=False)
     for (name, values), (color, dash), shape in styles:
         places = np.arange(1, len(values) + 1) if x is None else x
         axis.plot(places, values, dash, color=color, label=name, marker=shape)

@@ -118,8 +118,8 @@ def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_f
 @pytest.mark.parametrize(
     ("interval", "words"),
     [
-        ([5.0, 60.0], "larger by 32.5 points (5.0 to 60.0;"),
-        ([-60.0, 9.0], "smaller by 25.5 points"),
+        ([5.0, 60.0], "differ by 32.5 points (5.0 to 60.0;"),
+        ([-60.0, 9.0], "differ by -25.5 points"),
     ],
 )
 def test_whether_the_two_effects_differ_is_told_from_study_5_once_it_is_known(interval, words):
