@@ -146,12 +146,13 @@ def do_run(
         if not ours or (was and not repeat):  # another process has just finished it
             return
         print(f"{run.name}: {describe_progress(study, to)}", flush=True)
-        score = run_one(study, run, root, networks, repeat=was is not None)
+        run_one(study, run, root, networks, repeat=was is not None)
         if was:
             print(f"{run.name}: {compare_run(run, was, root)}", flush=True)
             return
         add_run(study, run, root, to)
-        print(f"{run.name}: mean return {score['mean']:.1f}", flush=True)
+        # Not its score: no arm is to be seen before the last run of its part.
+        print(f"{run.name}: is finished and in the tables", flush=True)
 
 
 def run_one(
