@@ -103,6 +103,15 @@ def test_the_runs_of_a_repeat_drive_the_same_tracks_and_are_in_the_tables(made):
     assert len(kept) == 12
 
 
+def test_a_run_that_ends_is_added_to_the_tables_and_its_score_is_not_told(
+    made, networks, tmp_path, capsys
+):
+    name, to = "seed0/frame/z/1", tmp_path / "data"
+    run_evolved(STUDY5, made, only=[name], to=to, networks=networks)
+    (mean,), told = tables.read("study5_runs", to)["mean"], capsys.readouterr().out
+    assert f"{name}: is finished" in told and f"{mean:.1f}" not in told
+
+
 def test_a_repeated_run_is_compared_with_the_recorded_one(made, networks, tmp_path, capsys):
     name = "seed0/input_output"
     world = tmp_path / "study5" / name / WORLD_FILE

@@ -6,6 +6,7 @@ import numpy as np
 
 from stad_lab.viz.plots import (
     STYLES,
+    VARIANT_STYLES,
     difference_colors,
     plot_curves,
     plot_histograms,
@@ -49,6 +50,14 @@ def test_neighbouring_lines_differ_in_colour_and_in_dashes():
     assert all(
         one[0] != other[0] and one[1] != other[1] for one, other in itertools.pairwise(STYLES[:6])
     )
+
+
+def test_a_variant_has_one_colour_whatever_it_is_drawn_with():
+    both = {"input_output": np.zeros(2), "input": np.ones(2)}
+    lines = plot_curves(both, "T", "x", "y").axes[0].lines
+    assert [line.get_color() for line in lines] == [VARIANT_STYLES[name][0] for name in both]
+    others = plot_curves({"frame": np.zeros(2), "CMA-ES": np.ones(2)}, "T", "x", "y").axes[0].lines
+    assert [line.get_color() for line in others] == [color for color, _ in STYLES[:2]]
 
 
 def test_every_part_of_a_stack_is_drawn():
