@@ -157,11 +157,11 @@ def do_run(
 
 def run_one(
     study: Evolved, run: EvolvedRun, root: Path, networks: Path = NETWORKS, repeat: bool = False
-) -> dict:
-    """Do what is missing of a run; returns its score. A repetition uses no kept log."""
+) -> None:
+    """Do what is missing of a run, and write its score. A repetition uses no kept log."""
     folder, kept = root / run.name, networks / study.name / run.name
     if (folder / SCORE).exists():
-        return load_json(folder / SCORE, kind="score")
+        return
     begin, keeps = time.perf_counter(), study.keeps_logs and not repeat
     with fixed_threads():
         sense = study.prepare(run, root, networks)
@@ -184,7 +184,6 @@ def run_one(
     save_json(
         folder / SCORE, {"kind": "score", "made_with": made_with, **score, "seconds": seconds}
     )
-    return score
 
 
 def score_controller(sense: Sense, controller: np.ndarray) -> dict:

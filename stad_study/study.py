@@ -177,8 +177,10 @@ def run_study(
         if not only and not unfinished(own, to):
             continue
         with claimed(root / f"seed{seed}" / variant) as ours:
+            if not ours:
+                continue
             # Asked again, because another process may have finished them just before.
-            for pipeline in (own if only else unfinished(own, to)) if ours else ():
+            for pipeline in own if only else unfinished(own, to):
                 print(f"{pipeline.name}: {describe_progress(study, wanted, to)}", flush=True)
                 run_pipeline(pipeline, root, executor)
                 if only and recorded(pipeline, to):

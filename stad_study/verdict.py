@@ -106,9 +106,10 @@ def describe_cause(study: dict) -> list[str]:
             one = comparisons[name]
             (low, high), points = one["interval"], f"{one['difference']:+.1f} points"
             points += f" (95% interval {low:.1f} to {high:.1f})"
-            told.append(f"With {change}, {what} changes by {points}: *{one['verdict']}*")
-            small = one["verdict"] == "gain" and high < MARGIN
-            told[-1] += f", but of fewer than {MARGIN} points." if small else "."
+            verdict = f"*{one['verdict']}*"
+            if one["verdict"] == "gain" and high < MARGIN:
+                verdict += f", but of fewer than {MARGIN} points"
+            told.append(f"With {change}, {what} changes by {points}: {verdict}.")
     if "interaction" in comparisons:
         told.append(read_repetition(comparisons["interaction"]["verdict"]))
     if set(CHANGED) <= set(comparisons):

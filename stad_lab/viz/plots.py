@@ -49,7 +49,7 @@ def describe(figure: Figure, title: str, lead: str, values: Iterable[str] = ()) 
 
 
 def styles_of(names: Iterable[str]) -> Iterable[tuple[str, str]]:
-    """Colour and dash of each line; a variant has its own if all names are variants."""
+    """Colour and dash of each line or row; a variant has its own if all names are variants."""
     names = list(names)
     own = set(names) <= set(VARIANT_STYLES)
     return [VARIANT_STYLES[name] for name in names] if own else cycle(STYLES)
@@ -175,7 +175,7 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
     Of a calibrated prediction the probability integral transform is uniform.
     """
     figure, ((axis,),) = new_figure(6.5, 3.2)
-    for (name, share), (color, dash) in zip(shares.items(), cycle(STYLES), strict=False):
+    for (name, share), (color, dash) in zip(shares.items(), styles_of(shares), strict=False):
         edges = np.linspace(0, 1, len(share) + 1)
         axis.stairs(share * len(share), edges, color=color, ls=dash, lw=1.8, label=name)
     axis.axhline(1, color="black", lw=1, ls="--", label="uniform")
@@ -250,7 +250,8 @@ def plot_returns(returns: dict[str, np.ndarray], title: str, paired: bool = Fals
     rng, text = np.random.default_rng(0), {"va": "center", "fontsize": 9}
     if paired:
         axis.plot(list(returns.values()), range(len(returns)), color="0.8", lw=1, zorder=0)
-    for row, (values, color) in enumerate(zip(returns.values(), cycle(COLORS), strict=False)):
+    styles = zip(returns.values(), styles_of(returns), strict=False)
+    for row, (values, (color, _)) in enumerate(styles):
         mean, spread = values.mean(), 0.22 * (not paired)
         heights = row + rng.uniform(-spread, spread, len(values))
         axis.scatter(values, heights, 12, color, alpha=0.6)

@@ -3,6 +3,7 @@
 import itertools
 
 import numpy as np
+from matplotlib.colors import to_hex
 
 from stad_lab.viz.plots import (
     STYLES,
@@ -13,6 +14,7 @@ from stad_lab.viz.plots import (
     plot_history,
     plot_intervals,
     plot_pictures,
+    plot_returns,
     plot_scatter,
     plot_stacks,
 )
@@ -56,6 +58,10 @@ def test_a_variant_has_one_colour_whatever_it_is_drawn_with():
     both = {"input_output": np.zeros(2), "input": np.ones(2)}
     lines = plot_curves(both, "T", "x", "y").axes[0].lines
     assert [line.get_color() for line in lines] == [VARIANT_STYLES[name][0] for name in both]
+    rows = plot_returns(both, "T").axes[0].collections
+    assert [to_hex(row.get_facecolor()[0]) for row in rows] == [
+        VARIANT_STYLES[name][0].lower() for name in both
+    ]
     others = plot_curves({"frame": np.zeros(2), "CMA-ES": np.ones(2)}, "T", "x", "y").axes[0].lines
     assert [line.get_color() for line in others] == [color for color, _ in STYLES[:2]]
 
