@@ -86,11 +86,11 @@ def difference_of_effects(claims: dict) -> str:
 
 
 def verdict(claims: dict) -> str:
-    """The verdict of study 1, a line for each sentence; and once it is known, that of part 5a."""
+    """The verdict of study 1, point by point; and once it is known, that of part 5a."""
     told = describe_verdict(claims["study1"])
     if claims["study5"]["comparisons"]:
-        source = "That is [study 5a](#is-it-the-motion), with the V, M and tracks of study 1."
-        told.insert(3, f"{difference_of_effects(claims)} {source}")
+        source = "That is [study 5a](#is-it-the-motion), no independent confirmation: the same"
+        told[2] += f" {difference_of_effects(claims)} {source} V and M suggested the question."
     return "\n".join(f"- {sentence}" for sentence in told)
 
 
@@ -121,29 +121,29 @@ def study1(claims: dict) -> str:
 
 def afterwards(claims: dict) -> str:
     """The comparisons that were computed after study 1."""
-    names = {"interaction": CAUSE["interaction"]}
+    names = {}
     for features, seen in SEEN.items():
         names[f"{features}: input_output less input"] = f"`input_output` - `input`, {seen}"
     names["input_output less input"] = CAUSE["input_output less input"]
-    lines, by_seed = [], claims["study1"]["afterwards"]["interaction"]["by_seed"]
+    lines, first = [], len(claims["study1"]["afterwards"]["interaction"]["by_seed"])
     for name, title in names.items():
         one = claims["study1"]["afterwards"][name]
         lines.append((title, difference_of(one), p_value(one["p"])))
     one, title = claims["studies1_and_6"], "`input_output` - `frame`, C sees z and h"
-    title += f", with {len(one['by_seed']) - len(by_seed)} seeds of study 6"
+    title += f", {len(one['by_seed'])} seeds, {len(one['by_seed']) - first} of them of study 6"
     lines.append((title, difference_of(one), p_value(one["p"])))
     return table(("comparison", "difference (95% interval)", "p"), lines)
 
 
 def cause(claims: dict) -> str:
-    """Study 5: how many runs are done, and of complete parts the verdicts, figure and tests."""
+    """Study 5: how many runs are done, and of complete parts the tests, figure and meaning."""
     study = claims["study5"]
     counts = (f"{part} {runs} of {study['planned'][part]}" for part, runs in study["runs"].items())
     parts = [f"Runs done: {', '.join(counts)}."]
     if study["comparisons"]:
-        verdicts = "\n".join(f"- {sentence}" for sentence in describe_cause(study))
+        meaning = "**" + " ".join(describe_cause(study)) + "**"
         tables = [cause_table(study), repeated_table(study, claims["study1"])]
-        parts = [verdicts, image("study5", claims), *tables, *parts]
+        parts = [meaning, image("study5", claims), *tables, *parts]
     return "\n\n".join(parts)
 
 
@@ -156,7 +156,10 @@ def cause_table(study: dict) -> str:
             low, high = one["t_interval"]
             cells = (title, difference_of(one), f"{low:.1f} to {high:.1f}")
             tests = [p_value(one[key]) for key in ("p", "holm_p") if key in one] or ["", ""]
-            lines.append((*cells, *tests, one.get("verdict", "described")))
+            outcome = one.get("verdict", "described")
+            if outcome == "gain" and one["interval"][1] < MARGIN:
+                outcome += f", of fewer than {MARGIN} points"
+            lines.append((*cells, *tests, outcome))
     head = ("comparison", "difference (95% interval)", "t-interval", "p", "Holm's p", "verdict")
     return table(head, lines)
 
