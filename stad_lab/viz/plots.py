@@ -300,7 +300,7 @@ def plot_intervals(
     rows = list(next(iter(panels.values())))
     contents = [series for found in panels.values() for series in found.values()]
     names = list(dict.fromkeys(name for series in contents for name in series))
-    shifts = np.linspace(-0.25, 0.25, len(names)) if len(names) > 1 else [0]
+    shifts = np.linspace(-0.2, 0.2, len(names)) if len(names) > 1 else [0]
     styles = dict(zip(names, zip(cycle("oDs^vP"), cycle(COLORS), shifts), strict=False))
     lines, width = -(-len(panels) // columns), 2.0 + 2.5 * columns if columns > 1 else 6.5
     singles = any(len(one) > 2 for series in contents for one in series.values())
@@ -327,6 +327,8 @@ def plot_intervals(
             if name in read:
                 values.append(" ".join(filter(None, (panel, row, name, f"{value:.3g}"))))
         name_rows(axis, rows)
+        for line in range(1, len(rows)) if len(names) > 1 else ():
+            axis.axhline(line - 0.5, color="0.9", lw=0.8)
         axis.grid(axis="x", color="0.9")
         axis.set_title(panel, fontsize=9)
     for axis in axes[-1]:
