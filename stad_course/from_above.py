@@ -179,7 +179,7 @@ def plot_road(
         axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85", label="road")
         for (name, path), (color, dash) in zip(paths.items(), styles_of(paths), strict=False):
             axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
-            axis.plot(*path[-1], "x", color=color, ms=7)
+            axis.plot(*path[-1], "x", color=color, ms=10, mew=2.5, zorder=5)
             for tail, head in zip(path[:-5:ARROWS], path[5::ARROWS], strict=False):
                 arrow = {"arrowstyle": "-|>", "color": color}
                 axis.annotate("", head, tail, arrowprops=arrow, annotation_clip=True)
