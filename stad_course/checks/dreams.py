@@ -85,7 +85,7 @@ def check_log_density(
 
 
 def moments_of_mixtures(moments: Callable) -> None:
-    """Mean and deviation of mixtures."""
+    """Mean and standard deviation of mixtures."""
     logpi, mean, widths, _ = mixtures()
     parts, pi = Normal(mean, widths.exp()), logpi.exp()
     both = MixtureSameFamily(Categorical(logits=logpi), parts)
@@ -97,22 +97,23 @@ def moments_of_mixtures(moments: Callable) -> None:
         "deviations were averaged, and the spread of the means is missing: add variances": (mixed),
         "the parts are wide, and that is missing: add their mean variance": between.sqrt(),
         "the squares are not weighed: use pi = exp(logpi)": (within + unweighed).sqrt(),
-        "a deviation was taken for a variance: that is its square, exp(2 * logsigma)": (
+        "a standard deviation was taken for a variance: that is its square, exp(2 * logsigma)": (
             mixed + between
         ).sqrt(),
         "this is the variance: take its square root": both.variance,
-        "deviations were added: add variances, then take the root": within.sqrt() + between.sqrt(),
+        "standard deviations were added: add variances, then take the root": within.sqrt()
+        + between.sqrt(),
     }
     found = ask("moments", moments, logpi, mean, widths)
     some = isinstance(found, tuple | list) or (isinstance(found, torch.Tensor) and found.ndim > 0)
     if not some or len(found) != 2:
         wrong = "moments must return two tensors"
-        raise WrongAnswer("moments", wrong, "return mean, deviation")
+        raise WrongAnswer("moments", wrong, "return mean, standard deviation")
     weigh = "use pi = exp(logpi)"
     centers = {f"the means are not weighed: {weigh}": mean.mean(-1)}
     centers[f"logpi, which is negative, was taken as the weight: {weigh}"] = (logpi * mean).sum(-1)
     check("the mean", found[0], both.mean, centers)
-    check("the deviation", found[1], both.stddev, mistakes)
+    check("the standard deviation", found[1], both.stddev, mistakes)
     what = "moments of (2, 2, 6) mixtures"
     deeper = (part.reshape(2, 2, 6, 5) for part in (logpi, mean, widths))
     found = ask(what, moments, *deeper)
