@@ -51,9 +51,8 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
     figure, axes = new_figure(8.0, 4.6, 2, 1, sharex=True)
     for axis, (features, title) in zip(axes[:, 0], SEEN.items(), strict=True):
         draw_margin(axis, margin)
-        if features == "z, h":  # what the paper's C sees
-            paper = f"paper, input_output: {reported:+.0f}"
-            axis.axvline(reported, color="black", linestyle="--", label=paper)
+        paper = f"paper, input_output: {reported:+.0f}"
+        axis.axvline(reported, color="black", linestyle="--", label=paper)
         for height, variant in enumerate(variants):
             plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
         name_rows(axis, variants)
