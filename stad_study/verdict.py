@@ -94,8 +94,8 @@ def describe_paper_gain(study: dict) -> str:
             baseline = study["arms"][f"{features}: frame"]["mean"]
             seen, best = features.replace(", ", " and "), f"{study['ceiling']:.0f}"
             text += f" With {seen} that says little, as they were out of reach: `frame` has"
-            text += f" {baseline:.0f} points, and the best pipeline of each track {best} (computed"
-            text += " afterwards)."
+            text += f" {baseline:.0f} points, and the best of all pipelines on each track has"
+            text += f" {best} on average (computed afterwards)."
     return text
 
 
