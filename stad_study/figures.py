@@ -48,10 +48,10 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
         reported: the gain of `input_output` that the paper reports, in points.
     """
     variants = [variant for variant in COLOURS if variant != "frame"]
+    paper = f"paper, input_output: {reported:+.0f}"
     figure, axes = new_figure(8.0, 4.6, 2, 1, sharex=True)
     for axis, (features, title) in zip(axes[:, 0], SEEN.items(), strict=True):
         draw_margin(axis, margin)
-        paper = f"paper, input_output: {reported:+.0f}"
         axis.axvline(reported, color="black", linestyle="--", label=paper)
         for height, variant in enumerate(variants):
             plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
