@@ -147,7 +147,7 @@ def plot_paths(
     middle, reach = (low + high) / 2, (high - low).max() / 2 + 2 * TRACK_WIDTH
     for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
         axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85")
-        drivers = ("agent", ~by_hand, BLUE, 4), ("you, by hand", by_hand, ORANGE, 12)
+        drivers = ("agent", ~by_hand, BLUE, 4), ("by hand", by_hand, ORANGE, 12)
         for driver, shown, color, size in drivers:
             if shown.any():
                 axis.scatter(*points[shown].T, label=driver, color=color, s=size)
