@@ -3,8 +3,6 @@
 Every sentence follows from the comparisons of `study_claims` and `study5_claims`.
 """
 
-from collections import Counter
-
 from stad_study.claims import PAPER_GAINS
 from stad_study.study_claims import LEVEL, MARGIN
 
@@ -17,7 +15,7 @@ SEES = {
 
 
 def describe_verdict(study: dict) -> list[str]:
-    """Five points: both verdicts, whether they differ, the other variants, the paper's gains.
+    """Four points: both verdicts, whether they differ, and the paper's gains.
 
     Args:
         study: what `describe_study1` returns after the last pipeline.
@@ -25,8 +23,7 @@ def describe_verdict(study: dict) -> list[str]:
     primary = {features: study["comparisons"][f"{features}: input_output"] for features in SEES}
     told = [describe_comparison(features, one) for features, one in primary.items()]
     told.append(describe_interaction(study["afterwards"]["interaction"]))
-    comparisons = study["comparisons"]
-    return [*told, describe_others(comparisons), describe_paper_gain(study)]
+    return [*told, describe_paper_gain(study)]
 
 
 def describe_comparison(features: str, one: dict) -> str:
@@ -68,16 +65,6 @@ def out_of_reach(study: dict, features: str) -> bool:
     return baseline + min(PAPER_GAINS.values()) > study["ceiling"]
 
 
-def describe_others(comparisons: dict[str, dict]) -> str:
-    """The verdicts of the differences of `input` and `output`, with their numbers."""
-    others = [one for name, one in comparisons.items() if not name.endswith(": input_output")]
-    points, count = [one["difference"] for one in others], len(others)
-    verdicts = Counter(one["verdict"] for one in others).most_common()
-    found = ", ".join(f"{number} *{verdict}*" for verdict, number in verdicts)
-    text = f"The {count} differences of `input` and `output` to `frame`, {min(points):+.1f} to"
-    return f"{text} {max(points):+.1f} points, are: {found}."
-
-
 def describe_paper_gain(study: dict) -> str:
     """How many intervals end below the gain of the paper, and where none could reach it."""
     comparisons = study["comparisons"]
@@ -93,7 +80,7 @@ def describe_paper_gain(study: dict) -> str:
         if out_of_reach(study, features):
             baseline = study["arms"][f"{features}: frame"]["mean"]
             seen, best = features.replace(", ", " and "), f"{study['ceiling']:.0f}"
-            text += f" With {seen} that says little, as they were out of reach: `frame` has"
+            text += f" With {seen} such gains were out of reach: `frame` has"
             text += f" {baseline:.0f} points, and the best of all pipelines on each track has"
             text += f" {best} on average (computed afterwards)."
     return text
