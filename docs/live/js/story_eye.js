@@ -1,5 +1,5 @@
 "use strict";
-// "32 numbers": what is left of a frame, three latents to move, and what information costs.
+// "32 numbers": what is left of a frame, and three latents to move.
 
 stad.figure("eye", async (part) => {
   const NAME = "input_output";
@@ -83,44 +83,4 @@ stad.figure("eye", async (part) => {
   part("back").addEventListener("click", () => take(place));
   new ResizeObserver(() => z && drawBars()).observe(part("bars"));
   take(0);
-
-  // The price of a nat, when its details are opened.
-  part("price").addEventListener(
-    "toggle",
-    async () => {
-      const { networks, frames } = await stad.load("nat");
-      const sheet = await stad.readPicture(await stad.load("nat_picture"));
-      const size = stad.FRAME_SIZE;
-      const cells = [0, 1].map((row) =>
-        Array.from({ length: frames }, (_, i) => {
-          const canvas = document.createElement("canvas");
-          [canvas.width, canvas.height, canvas.className] = [size, size, "pixels"];
-          canvas.setAttribute("role", "img");
-          canvas.setAttribute("aria-label", `frame ${i + 1}${row ? ", decoded" : ""}`);
-          part("strip").append(canvas);
-          return canvas;
-        }),
-      );
-      part("strip").style.gridTemplateColumns = `repeat(${frames}, minmax(0, 1fr))`;
-      const show = () => {
-        const one = networks[Number(part("weight").value)];
-        cells.forEach((line, row) =>
-          line.forEach((canvas, i) => {
-            const x = row ? (Number(part("weight").value) + 1) * size : 0;
-            const from = [x, 2 * i * size, size, size];
-            canvas.getContext("2d").drawImage(sheet.canvas, ...from, 0, 0, size, size);
-          }),
-        );
-        const used = one.kl_of_latents.filter((value) => value > 0.05).length;
-        const text = `KL weight ${one.kl_weight}: ${used} of 32 numbers in use.`;
-        part("spent").textContent = text;
-        part("weight").setAttribute("aria-valuetext", text);
-      };
-      part("weight").max = networks.length - 1;
-      part("weight").addEventListener("input", show);
-      show();
-    },
-    { once: true },
-  );
-  if (part("price").open) part("price").dispatchEvent(new Event("toggle")); // opened meanwhile
 });
