@@ -39,6 +39,7 @@ from stad_study.verdict import (
     describe_ceiling,
     describe_repetition,
     describe_verdict,
+    name_verdict,
     out_of_reach,
 )
 
@@ -76,7 +77,11 @@ def paper_table(claims: dict) -> str:
 
 def finding(claims: dict) -> str:
     """The finding of the replication, for the overview: both verdicts, and their limit."""
-    told = [*describe_verdict(claims["study1"])[:2], describe_ceiling(claims["study1"])]
+    study = claims["study1"]
+    told = [*describe_verdict(study)[:2], describe_ceiling(study)]
+    others = [one for name, one in study["comparisons"].items() if "input_output" not in name]
+    if all(one["verdict"] != "gain" for one in others):
+        told.append("`input` and `output` show no gain.")
     return " ".join(told).strip()
 
 
@@ -96,7 +101,7 @@ def gains(claims: dict) -> str:
     for features in SEEN:
         one = study["comparisons"][f"{features}: input_output"]
         points = f"{one['difference'] + 0.0:.0f} points".replace("-0 ", "0 ")
-        told.append(f"*{one['verdict']}* ({points})")
+        told.append(f"{name_verdict(one)} ({points})")
     both, alone = told
     if out_of_reach(study, "z, h"):
         both += "; the paper's gain was out of reach"

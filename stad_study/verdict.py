@@ -30,12 +30,16 @@ def describe_comparison(features: str, one: dict) -> str:
     """The verdict of one primary comparison, with its interval."""
     points, (low, high) = one["difference"], one["interval"]
     text = f"If C sees {SEES[features]}, `input_output` minus `frame` is {points:+.1f} points"
-    text += f" (95% interval {low:.1f} to {high:.1f}): *{one['verdict']}*"
-    if one["verdict"] == "gain" and low < MARGIN:
-        text += ", perhaps too small to matter"
+    text += f" (95% interval {low:.1f} to {high:.1f}): {name_verdict(one)}"
     if one["verdict"] == "undecided":
         text += f"; {one['seeds_that_decide']} seeds would decide"
     return text + "."
+
+
+def name_verdict(one: dict) -> str:
+    """The verdict of a comparison, and whether a gain may be smaller than the margin."""
+    small = one["verdict"] == "gain" and one["interval"][0] < MARGIN
+    return f"*{one['verdict']}*{', perhaps too small to matter' if small else ''}"
 
 
 def describe_interaction(one: dict) -> str:
