@@ -37,6 +37,7 @@ from stad_study.verdict import (
     PAPER_GAIN,
     describe_cause,
     describe_ceiling,
+    describe_others,
     describe_repetition,
     describe_verdict,
     name_verdict,
@@ -76,13 +77,10 @@ def paper_table(claims: dict) -> str:
 
 
 def finding(claims: dict) -> str:
-    """The finding of the replication, for the overview: both verdicts, and their limit."""
+    """The finding of the replication, for the overview: the verdicts, and their limit."""
     study = claims["study1"]
-    told = [*describe_verdict(study)[:2], describe_ceiling(study)]
-    others = [one for name, one in study["comparisons"].items() if "input_output" not in name]
-    if all(one["verdict"] != "gain" for one in others):
-        told.append("`input` and `output` show no gain.")
-    return " ".join(told).strip()
+    told = [*describe_verdict(study)[:2], describe_ceiling(study), describe_others(study)]
+    return " ".join(filter(None, told))
 
 
 def verdict(claims: dict) -> str:

@@ -63,6 +63,13 @@ def describe_ceiling(study: dict) -> str:
     return f"With {' or '.join(seen)} the paper's gain was out of reach." if seen else ""
 
 
+def describe_others(study: dict) -> str:
+    """That no other variant has a gain, for the overview; else nothing."""
+    others = [one for name, one in study["comparisons"].items() if "input_output" not in name]
+    gained = any(one["verdict"] == "gain" for one in others)
+    return "" if gained else "`input` and `output` show no gain."
+
+
 def out_of_reach(study: dict, features: str) -> bool:
     """Whether `frame` with the smallest gain of the paper is above the best run of each track."""
     baseline = study["arms"][f"{features}: frame"]["mean"]

@@ -8,7 +8,7 @@ import pytest
 
 from stad_study.claims import read_claims
 from stad_study.study_claims import FEATURES, find_verdict
-from stad_study.verdict import describe_cause, describe_verdict
+from stad_study.verdict import describe_cause, describe_others, describe_verdict
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import blocks
@@ -73,6 +73,11 @@ def test_where_the_best_pipelines_do_not_reach_the_gain_of_the_paper_the_page_sa
     assert "With z and h the paper's gain was out of reach." in blocks.finding({"study1": study})
     study["ceiling"] = 931.0
     assert "out of reach" not in describe_verdict(study)[-1] + blocks.finding({"study1": study})
+
+
+def test_the_overview_says_that_no_other_variant_gains_only_if_none_does():
+    assert describe_others(study_with(["undecided"] * 2)) == "`input` and `output` show no gain."
+    assert describe_others(study_with(("gain", "undecided"))) == ""
 
 
 def cause_with(changed=()):
