@@ -50,7 +50,7 @@ def problem_of_ask(own: Ask) -> str:
     mean, count = np.array([5.0, -5.0, 0.0]), 4000
     found, problem = run(own, mean, 0.5, count, np.random.default_rng(1), shape=(count, 3))
     if problem:
-        return f"ask {problem}: expected an array (count, numbers)"
+        return f"ask {problem}: expected an array (count, len(mean))"
     if not np.isfinite(found).all():
         return "ask returns numbers that are not finite: add sigma times the random numbers"
     if np.abs(found.mean(axis=0) - mean).max() > 0.1:
