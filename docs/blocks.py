@@ -595,9 +595,6 @@ def stays(study: dict, features: str) -> int:
 
 
 NUMBERS: dict[str, Callable[[dict], float]] = {
-    "best episode": lambda claims: max(
-        one["best_episode"] for one in claims["experiments"].values()
-    ),
     "trained networks": lambda claims: sum(claims["study1"]["trained_on"].values()),
     "networks of a GPU": lambda claims: sum(
         count for name, count in claims["study1"]["trained_on"].items() if name != "cpu"

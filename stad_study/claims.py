@@ -34,7 +34,6 @@ def compute_claims() -> dict[str, dict]:
     """All statistics as plain numbers: section -> name -> statistics."""
     episodes, runs = tables.episodes(), tables.read("runs")
     made = [name for name in (*BASELINE_DRIVERS, *EXPERIMENTS) if name in set(episodes.experiment)]
-    trained = [name for name in made if name in set(runs.query("role == 'world_model'").experiment)]
     return {
         "study1": study_claims.describe_study1(),
         "study2": study2_claims.describe_study2(),
@@ -47,7 +46,6 @@ def compute_claims() -> dict[str, dict]:
         "experiments": {name: describe_experiment(name, episodes, runs) for name in made},
         "probe": measurements.describe_probe(tables.read("probe")),
         "models": measurements.describe_models(tables.read("model_metrics")),
-        "stage_minutes": {name: measurements.stage_minutes(runs, name) for name in trained},
         "speed": measurements.describe_speed(tables.read("speed")),
     }
 

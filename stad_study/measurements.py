@@ -33,13 +33,6 @@ def describe_models(metrics: pandas.DataFrame) -> dict:
     return found
 
 
-def stage_minutes(runs: pandas.DataFrame, name: str) -> dict:
-    """Minutes of each stage, from an empty folder to the evaluated agent of seed 0."""
-    own = runs[(runs.experiment == name) & (runs.seed == 0)].filter(like="seconds.")
-    minutes = (own.sum() / 60).rename(lambda column: column.removeprefix("seconds."))
-    return {**minutes.to_dict(), "all": float(minutes.sum())}
-
-
 def describe_speed(speed: pandas.DataFrame) -> dict:
     """Median over the rounds, and ratio to the reference, by "PART: MEASURE" and condition."""
     found = {}

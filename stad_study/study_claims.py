@@ -38,12 +38,11 @@ def describe_study1(folder: Path = tables.DATA) -> dict:
     for variants in FAMILIES.values():
         comparisons |= compare_family(returns, areas, variants)
     arms = {arm: describe_arm(own, areas[arm]) for arm, own in returns.items()}
-    bands = {arm: over_episodes(*curve) for arm, curve in curves.items()}
     found |= {"arms": arms, "comparisons": comparisons}
     found |= {"afterwards": compare_afterwards(returns)}
     found |= {"verdicts_without_a_seed": leave_one_out(returns)}
     found |= {"equivalence": describe_equivalence(returns), "ceiling": find_ceiling(returns)}
-    return found | {"curves": bands, "curve_differences": curve_differences(curves)}
+    return found | {"curve_differences": curve_differences(curves)}
 
 
 def describe_progress(planned: Study, runs: pandas.DataFrame) -> dict:
@@ -198,7 +197,6 @@ def describe_arm(returns: np.ndarray, areas: np.ndarray) -> dict:
         **{name: tail[name] for name in ("below_800", "tenth_percentile", "minimum")},
         "interquartile_mean": statistics.interquartile_mean(returns),
         "area": float(areas.mean()),
-        "areas": areas.tolist(),
     }
 
 

@@ -5,7 +5,6 @@ sees every frame and M remembers every action, also while the human drives. So t
 over at any frame, and a dream can begin at any frame.
 """
 
-from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -90,7 +89,6 @@ class Session:
         track: seed of the present track.
         score: return of the real episode so far.
         best: of each track, the highest score of a whole episode that the human alone drove.
-        earlier: the last four episodes before this one, as (track, Trajectory), newest last.
 
     The session changes the memory of its agent, so give it one of its own.
     """
@@ -103,8 +101,6 @@ class Session:
         self.racing = racing
         self.dream = DreamEnv(agent.vae, agent.mdn_rnn, render_mode="rgb_array")
         self.dreamer = Dreamer(self.dream, agent.parameters)
-        self.earlier: deque[tuple[int, Trajectory]] = deque(maxlen=4)
-        self.track = track
         self.rows: list[tuple] = []
         self.dream_rows: list[tuple] = []
         self.drivers: list[str] = []
@@ -117,8 +113,6 @@ class Session:
         """Begin an episode on a real track (ValueError for others than 0 to 999,999)."""
         if not isinstance(track, int | np.integer) or not 0 <= track <= LAST_TRACK:
             raise ValueError(f"track={track!r}: expected a whole number from 0 to {LAST_TRACK:,}")
-        if self.rows:
-            self.earlier.append((self.track, self.trajectory()))
         self.track, self.score, self.world = int(track), 0.0, "real"
         self.rows, self.dream_rows, self.drivers, self.poses = [], [], [], []
         self.real_ended, self.dream_ended = False, False

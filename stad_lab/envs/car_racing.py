@@ -182,12 +182,6 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         self._check_begun("track")
         return self.cars.tracks[0].path
 
-    @property
-    def position(self) -> np.ndarray:
-        """Where the hull is, world units, float64 (2,)."""
-        self._check_begun("position")
-        return self.cars.cars["position"][0, 0].astype(float)
-
     def place(self, tile: int, *how: float, **named: float) -> np.ndarray:
         """Put the car on a tile, as `Cars.place`; returns the observation there."""
         self._check_begun("place")

@@ -25,7 +25,6 @@ class DreamEnv(gym.Env):
 
     Attributes:
         temperature: of the sampling, above 0; may be changed between steps.
-        prediction: the mixture from which the present z was sampled; None right after `reset`.
 
     Args:
         vae, mdn_rnn: V and M, of one run.

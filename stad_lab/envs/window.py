@@ -15,7 +15,7 @@ class Window:
     def __init__(self, mode: str):
         self.mode = mode
         self.env = reference.CarRacing(render_mode=mode)
-        self.env.car, self.track = None, None
+        self.env.car = None
 
     def draw(self, cars: Cars, car: int = 0) -> np.ndarray | None:
         """Copy the state of a car and draw it with Gymnasium's code."""

@@ -1,4 +1,4 @@
-"""Trajectories: recorded episodes with the true motion of the car, and what V and M make of them.
+"""Trajectories: recorded episodes with the true motion of the car.
 
 Training sees frames and actions only. To ask what a latent encodes of the car's motion, one must
 know the motion: here it is read from the simulator. The tracks are from a range of their own,
@@ -8,17 +8,14 @@ know the motion: here it is read from the simulator. The tracks are from a range
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 
 from stad_lab.agent import Agent, Driver, rollout
 from stad_lab.config import Config
 from stad_lab.envs.cars import Cars
-from stad_lab.envs.frames import episode_differences, to_frame
+from stad_lab.envs.frames import to_frame
 from stad_lab.envs.state import MOTION, true_motion
-from stad_lab.features import encode_episode, remember_episode
-from stad_lab.io.weights import WorldModel
-from stad_lab.models.mdn_rnn import Mixture
-from stad_lab.models.vae import VAE, to_array, to_uint8
+from stad_lab.features import encode_episode
+from stad_lab.models.vae import VAE
 from stad_lab.training.dataset import random_start
 
 FRAMES_A_SECOND = 50  # of CarRacing's physics
@@ -89,41 +86,8 @@ def record_trajectory(agent: Agent, track: int, frames: int) -> Trajectory:
     return record(agent, cars, frames)
 
 
-@dataclass(frozen=True)
-class Inspection:
-    """What V and M make of a trajectory of T frames."""
-
-    frames: np.ndarray  # what V saw: uint8 (T, 64, 64, 3)
-    differences: np.ndarray  # float32 (T, 64, 64, 3) in [-1, 1]
-    frame_reconstructions: np.ndarray  # decoded from mu: uint8 (T, 64, 64, 3)
-    difference_reconstructions: np.ndarray | None  # None if V does not reconstruct them
-    mu: np.ndarray  # means of z: float32 (T, latent_size)
-    hidden: np.ndarray  # M's memory before the frame, which C sees with z: float32 (T, hidden_size)
-    mixture: Mixture  # predicted after frame and action: parts (1, T, latent_size, mixtures)
-
-
 def encode_trajectory(
     vae: VAE, trajectory: Trajectory, stride: int, crop_bar: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """V's mu and logvar, float32 (T, latent_size) each; stride and bar as V was trained."""
     return tuple(encode_episode(vae, trajectory.frames(crop_bar), stride))
-
-
-@torch.no_grad()
-def inspect_trajectory(world_model: WorldModel, trajectory: Trajectory) -> Inspection:
-    """Show V and M a trajectory from its first frame on, and keep all that they make of it."""
-    vae, mdn_rnn, stride = world_model.vae, world_model.mdn_rnn, world_model.stride
-    frames = trajectory.frames(world_model.crop_bar)
-    mu = encode_episode(vae, frames, stride)[0]
-    z, actions = torch.from_numpy(mu), torch.from_numpy(trajectory.actions)
-    mixture, _ = mdn_rnn(z[None], actions[None])
-    decoded, changed = vae.decode(z)
-    return Inspection(
-        frames=frames,
-        differences=episode_differences(frames, stride),
-        frame_reconstructions=to_uint8(decoded),
-        difference_reconstructions=None if changed is None else to_array(changed),
-        mu=mu,
-        hidden=remember_episode(mdn_rnn, mu, trajectory.actions),
-        mixture=mixture,
-    )

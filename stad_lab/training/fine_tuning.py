@@ -71,8 +71,8 @@ def fine_tune(
     check_same(earlier, before["config"], fixed)
     load_agent(earlier)  # that V, M and C are whole, before any work
 
-    def stage(pool: Executor) -> bool:
-        return begin(config, earlier, folder) | evolve(config, folder, pool)
+    def stage(executor: Executor | None) -> bool:
+        return begin(config, earlier, folder) | evolve(config, folder, executor)
 
     return run_stages({"controller": stage}, config, folder, None, executor, before)
 

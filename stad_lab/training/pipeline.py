@@ -23,7 +23,6 @@ from stad_lab.config import Config
 from stad_lab.inference import Inference
 from stad_lab.io.files import load_json, locked, save_json
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_world_model
-from stad_lab.io.workers import worker_threads
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training import second_iteration
@@ -55,7 +54,7 @@ STAGES = ("dataset", "vae", "mdn_rnn", "controller")
 WEIGHTS = (VAE_FILE, MDN_RNN_FILE, START_FILE, COMPONENTS_FILE, CONTROLLER_FILE)
 RUN_FILES = (*WEIGHTS, LOG, RECORD, MANIFEST)
 
-Stage = Callable[[Executor], bool]
+Stage = Callable[[Executor | None], bool]
 """Does what is missing; returns False if nothing was."""
 StageWatch = Callable[[str, list[dict]], None]
 """Called with a stage's name and its history, or the generations of CMA-ES."""
@@ -116,15 +115,15 @@ def make_stages(
     watched = {name: watch and functools.partial(watch, name) for name in STAGES[1:]}
     dataset = functools.cache(lambda: Dataset(data))  # read and checked once for all stages
 
-    def collect_stage(pool: Executor) -> bool:
+    def collect_stage(executor: Executor | None) -> bool:
         if earlier:
-            return second_iteration.collect_again(config, earlier, data, pool)
-        return collect(config, data, pool)
+            return second_iteration.collect_again(config, earlier, data, executor)
+        return collect(config, data, executor)
 
-    def controller_stage(pool: Executor) -> bool:
+    def controller_stage(executor: Executor | None) -> bool:
         did = earlier is not None and second_iteration.carry_over(config, earlier, dataset, folder)
         did |= find_components(config, dataset, folder)
-        return did | evolve(config, folder, pool, watched["controller"])
+        return did | evolve(config, folder, executor, watched["controller"])
 
     return {
         "dataset": collect_stage,
@@ -176,8 +175,7 @@ def run_stages(
         for name, stage in stages.items():
             with timed(record, made, name, folder) as note:
                 try:
-                    with worker_threads(config.processes, executor) as pool:
-                        did = stage(pool)
+                    did = stage(executor)
                 except (ValueError, OSError):  # refused: what it noted so far stays
                     raise
                 except BaseException:  # an interrupted stage has worked, too

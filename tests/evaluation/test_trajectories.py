@@ -12,7 +12,6 @@ from stad_lab.evaluation.trajectories import (
     MOTION,
     Recorder,
     encode_trajectory,
-    inspect_trajectory,
     record_random_trajectory,
     record_trajectory,
     road_in_sight,
@@ -108,21 +107,6 @@ def test_an_agent_s_trajectory_is_recorded_as_it_was_driven(agent):
 def test_a_trajectory_without_a_frame_is_refused():
     with pytest.raises(ValueError, match="without a frame: drive at least one frame"):
         Recorder(Cars(1)).trajectory([])
-
-
-def test_an_inspection_is_what_the_agent_saw(agent):
-    trajectory = record_trajectory(agent, track=4, frames=12)
-    found = inspect_trajectory(agent.world_model, trajectory)
-    agent.reset()
-    for t in range(12):
-        agent.act(trajectory.observations[t])
-        assert np.allclose(found.mu[t], agent.latents[0], atol=1e-4)
-        assert np.allclose(found.hidden[t], agent.hidden[0], atol=1e-4)
-    assert found.frame_reconstructions.shape == found.frames.shape == found.differences.shape
-    assert found.frame_reconstructions.dtype == np.uint8
-    assert found.difference_reconstructions.shape == found.differences.shape
-    assert found.mixture.logpi.shape[:3] == (1, 12, 32)
-    assert np.abs(found.differences[: agent.world_model.stride]).max() == 0
 
 
 def test_m_s_memory_before_a_frame_does_not_depend_on_it(agent, random_trajectory):

@@ -161,16 +161,17 @@ def test_the_number_of_seeds_that_decide_does_so_for_every_mean(tests):
         assert study_claims.find_verdict(interval, p) != "undecided"
 
 
-def test_the_secondary_outcomes_of_an_arm_are_those_of_its_episodes(found):
+def test_the_secondary_outcomes_of_an_arm_are_those_of_its_episodes(found, full):
     every = np.array([returns_of(seed, "output", "z") for seed in range(SEEDS)])
     arm, flat = found["arms"]["z: output"], np.sort(every.ravel())
     assert arm["below_800"] == (flat < 800).mean() and arm["minimum"] == flat[0]
     assert arm["tenth_percentile"] == np.percentile(flat, 10)
     assert arm["interquartile_mean"] == pytest.approx(flat[1200:3600].mean())
     # 100, 300, 500 at equal distances: the mean height is 300, more by the gain and the seed.
-    assert arm["areas"] == pytest.approx([300 - 60 + seed for seed in range(SEEDS)])
+    assert arm["area"] == pytest.approx(np.mean([300 - 60 + seed for seed in range(SEEDS)]))
     assert found["comparisons"]["z: output"]["area_difference"] == pytest.approx(-60)
-    curve = found["curves"]["z: output"]
+    curves = study_claims.learning_curves("study1", full)
+    curve = study_claims.over_episodes(*curves["z: output"])
     assert curve["episodes"] == [1060, 1220, 1380]
     assert curve["mean"] == pytest.approx([45.5, 245.5, 445.5])
 

@@ -11,7 +11,6 @@ from ipywidgets import HTML, FloatSlider
 from matplotlib.figure import Figure
 from PIL import Image
 
-from stad_lab.evaluation.trajectories import inspect_trajectory, record_trajectory
 from stad_lab.viz.video import animate_pictures, film_agent
 from stad_lab.viz.widgets import (
     explore,
@@ -28,13 +27,6 @@ def find(widget, kind):
     return ([widget] if isinstance(widget, kind) else []) + [
         found for child in getattr(widget, "children", ()) for found in find(child, kind)
     ]
-
-
-@pytest.fixture
-def inspected(agent):
-    """A short trajectory and its inspection."""
-    trajectory = record_trajectory(agent, track=4, frames=9)
-    return trajectory, inspect_trajectory(agent.world_model, trajectory)
 
 
 def test_the_latent_explorer_has_a_slider_for_each_latent_and_decodes_in_less_than_100_ms(agent):

@@ -113,7 +113,7 @@ stad.start(async () => {
 
   /** Encode the present frame, and take its z. */
   function encode() {
-    const { mu } = vae.encode(drive.bytes(t), drive.bytes(drive.earlier(t)));
+    const mu = vae.encodeMean(drive.bytes(t), drive.bytes(drive.earlier(t)));
     vae.mu = mu;
     take(mu);
     stad.paintFrame(get("frame"), drive.frame(t));

@@ -66,7 +66,6 @@ stad.start(async () => {
       track = prepare(message.track);
       return;
     }
-    if (message.type !== "state") return;
     [before, state, arrived] = [state, message, performance.now()];
     if (before?.phase !== state.phase) changePhase(before?.phase);
     if (message.seen) showSeen(message.seen);
@@ -528,10 +527,7 @@ stad.start(async () => {
   }
 
   let [touching, touched, endedAt] = [false, false, 0]; // a finger drives; has steered; when it ended
-  const KEYS = {
-    ArrowLeft: "left", ArrowRight: "right", ArrowUp: "gas", ArrowDown: "brake",
-    KeyA: "left", KeyD: "right", KeyW: "gas", KeyS: "brake", Space: "brake",
-  }; // prettier-ignore
+  const KEYS = { ...stad.PEDAL_KEYS, Space: "brake" };
   const TAKES_KEYS = "select, textarea, input:not([type=checkbox])";
 
   document.addEventListener("keydown", (event) => {

@@ -56,7 +56,6 @@ stad.Race = class {
 
   async load({ code, facts, tables }) {
     this.engine = await stad.Engine.make(code, facts, tables);
-    this.post({ type: "loaded" });
   }
 
   /** The tensors of an agent's networks: it drives the ghost, and its V and M are also the reader's. */
@@ -142,7 +141,6 @@ stad.Race = class {
     const message = {
       type: "state",
       phase: this.phase,
-      time: performance.now(),
       you: you.report(),
       rival: rival.report(),
       asleep: shown.asleep,

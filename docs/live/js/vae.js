@@ -49,23 +49,12 @@ stad.VAE = class {
   }
 
   /**
-   * q(z | x) = N(mu, exp(logvar)).
+   * The mean of q(z | x): what the agent sees.
    * @param {Uint8Array} frame 64 x 64 x 3
    * @param {Uint8Array} earlier the frame from which the difference image is taken
-   * @returns {{mu: Float32Array, logvar: Float32Array}}
+   * @returns {Float32Array}
    */
-  encode(frame, earlier) {
-    const moments = this.run(frame, earlier, 2 * this.latentSize);
-    const logvar = moments.slice(this.latentSize).map((value) => stad.softBound(value, -10, 10));
-    return { mu: moments.slice(0, this.latentSize), logvar };
-  }
-
-  /** The mean of q(z | x) alone: what the agent sees. */
   encodeMean(frame, earlier) {
-    return this.run(frame, earlier, this.latentSize);
-  }
-
-  run(frame, earlier, count) {
     const { engine, memory } = this;
     memory.write(this.frames[0], frame);
     memory.write(this.frames[1], earlier);
@@ -76,7 +65,7 @@ stad.VAE = class {
       layer.run(x, inputs, y);
       [x, inputs] = [y, layer.patches * layer.outputs];
     });
-    return memory.read(Float32Array, x, count).slice();
+    return memory.read(Float32Array, x, this.latentSize).slice();
   }
 
   /**
