@@ -165,9 +165,13 @@ def test_an_agent_drives_gymnasium_s_own_car_racing(agent):
     env.close()
 
 
-def test_a_script_needs_only_gymnasium_and_load_agent(quick_run, tmp_path):
+def test_a_fresh_script_dreams_by_a_name_and_drives_with_load_agent(quick_run, tmp_path):
     script = f"""
 import gymnasium
+env = gymnasium.make("stad_lab:StadLab/Dream-v0", agent="frame", render_mode="rgb_array")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+print(env.render().shape, env.unwrapped.vae.variant)
 from stad_lab import load_agent
 env = gymnasium.make("CarRacing-v3")
 agent = load_agent({str(quick_run)!r})
@@ -180,7 +184,7 @@ print("drove")
     (tmp_path / "script.py").write_text(script)
     command = [sys.executable, tmp_path / "script.py"]
     process = subprocess.run(command, capture_output=True, text=True, timeout=60)
-    assert process.stdout == "drove\n", process.stderr
+    assert process.stdout == "(64, 64, 3) frame\ndrove\n", process.stderr
 
 
 def test_cars_in_a_batch_end_one_by_one_with_the_returns_of_single_ones():

@@ -334,11 +334,22 @@ def violations(page, part, **options):
     ]
 
 
+# On a phone the theme lets an article's frame scroll, so that the article itself is never too wide.
+RIGHT_END = """() => {
+    const [frame, article] = [".content", "article"].map((one) => document.querySelector(one))
+    const hidden = frame ? frame.scrollWidth - frame.clientWidth : 0
+    return hidden > 1 ? Infinity : (article?.getBoundingClientRect().right ?? 0)
+}"""
+
+
 def all_violations(page, file):
-    """What axe holds against a file of the site, in both themes."""
+    """What axe holds against a file of the site, in both themes; and no page is too wide."""
     page.goto(file.as_uri())
     page.evaluate("window.MathJax?.startup?.promise.then(() => 0)")
     page.wait_for_selector("#live[data-state=ready], body:not(:has(#live))")
+    for width in (390, 1100, 1300, 360):
+        page.set_viewport_size({"width": width, "height": 900})
+        assert page.evaluate(RIGHT_END) <= width, file
     page.evaluate("document.body.dataset.theme = 'light'")
     part = "html" if file.stem == "index" else "article"  # the sidebar is alike everywhere
     found = violations(page, part, rules={"color-contrast": {"enabled": False}})
@@ -374,7 +385,9 @@ def kinds_of_pages(folder):
     return sorted(chosen), [file for file in pages if file not in chosen]
 
 
-def test_axe_finds_nothing_serious_in_either_theme(site, browser):
+def test_no_page_is_wider_than_its_window_and_axe_finds_nothing_serious_in_either_theme(
+    site, browser
+):
     check_accessible(kinds_of_pages(site[0])[0], browser)
 
 
@@ -394,22 +407,3 @@ def test_a_film_can_be_paused_and_begins_still_for_who_wants_no_motion(site, bro
             )
             button.press("Enter")
         page.close()
-
-
-# On a phone the theme lets an article's frame scroll, so that the article itself is never too wide.
-RIGHT_END = """() => {
-    const [frame, article] = [".content", "article"].map((one) => document.querySelector(one))
-    const hidden = frame ? frame.scrollWidth - frame.clientWidth : 0
-    return hidden > 1 ? Infinity : (article?.getBoundingClientRect().right ?? 0)
-}"""
-
-
-def test_no_page_is_wider_than_its_window(site, browser):
-    page = browser.new_page()
-    for file in kinds_of_pages(site[0])[0]:
-        page.set_viewport_size({"width": 390, "height": 900})
-        page.goto(file.as_uri())
-        for width in (390, 1100, 1300):
-            page.set_viewport_size({"width": width, "height": 900})
-            assert page.evaluate(RIGHT_END) <= width, file
-    page.close()

@@ -151,12 +151,6 @@ def test_an_episode_in_the_page_equals_pythons_to_the_last_bit(page, rng_seed):
         compare_episode(page.evaluate, seed, 200)
 
 
-def test_firefox_drives_to_the_last_bit_too(firefox, live_pages, rng_seed):
-    firefox.open((live_pages / "story.html").as_uri())
-    firefox.evaluate(LOAD)
-    compare_episode(firefox.evaluate, rng_seed, 200)
-
-
 def test_an_agent_in_the_page_sees_and_acts_as_in_python(page):
     compare_agent(page.evaluate, "input_output", 7, 120)
 

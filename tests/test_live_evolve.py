@@ -44,14 +44,14 @@ def running(browser, live_pages):
     page.on("request", lambda one: one.url.startswith("http") and errors.append(one.url))
     page.goto((live_pages / "evolve.html").as_uri() + SMALL)
     page.wait_for_selector("#live[data-state=ready]")
-    evolve(page, 2)
+    evolve(page, 1)
     yield page, errors
     page.close()
 
 
 @pytest.fixture
 def evolved(running):
-    """A page after two or more generations: a generation takes seconds, so tests share the page."""
+    """A page after one or more generations: a generation takes seconds, so tests share the page."""
     page, errors = running
     yield page
     assert not errors

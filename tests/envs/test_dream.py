@@ -1,7 +1,5 @@
 """The dream: a Gymnasium environment, repeatable for a seed, in which an agent drives."""
 
-import subprocess
-import sys
 import warnings
 
 import gymnasium as gym
@@ -230,18 +228,6 @@ def test_one_car_dreams_with_its_own_c_and_several_cannot(agent, observations):
     assert np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-4)
     alone.parameters = rows[0]
     assert not np.allclose(dream_on(many, 3)[1], dream_on(alone, 3)[1], atol=1e-2)
-
-
-def test_gymnasium_makes_the_dream_of_an_agent_by_its_name_in_a_fresh_process():
-    code = """
-import gymnasium, numpy as np
-env = gymnasium.make("stad_lab:StadLab/Dream-v0", agent="frame", render_mode="rgb_array")
-env.reset(seed=0)
-env.step(np.zeros(3, np.float32))
-print(env.render().shape, env.unwrapped.vae.variant)
-"""
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert process.stdout == "(64, 64, 3) frame\n", process.stderr
 
 
 def test_a_dream_is_made_of_a_name_or_a_folder():

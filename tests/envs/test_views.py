@@ -98,8 +98,9 @@ def test_a_skipped_frame_is_driven_and_not_drawn(monkeypatch):
 
 
 def test_a_picture_of_another_size_shows_what_the_usual_one_shows():
-    usual, large, small = (make_env(**options) for options in ({}, {"size": 288}, {"size": 32}))
-    seen = [drive(env, 60)[0][-1].astype(float) for env in (usual, large, small)]
+    sizes = ({}, {"size": 288}, {"size": 32})
+    usual, large, small = (make_env(frame_skip=20, **options) for options in sizes)
+    seen = [drive(env, 3)[0][-1].astype(float) for env in (usual, large, small)]
     for other, size in ((seen[1], 288), (seen[2], 32)):
         assert other.shape == (size, size, 3)
         scaled = Image.fromarray(seen[0].astype(np.uint8)).resize((size, size), Image.BOX)

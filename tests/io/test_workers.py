@@ -160,25 +160,24 @@ def test_no_more_results_wait_to_be_taken_than_are_asked_for():
     assert sorted(begun) == list(range(20))
 
 
-def test_a_script_without_a_main_guard_ends_with_one_line_that_says_what_to_do(tmp_path):
-    call = "from stad_lab.evaluation.evaluate import evaluate; evaluate('input', 2)"
-    process = run_script(tmp_path, f"from stad_lab import Config\n{call}\n")
+def test_a_script_without_a_main_guard_may_train_and_where_it_needs_processes_ends_in_one_line(
+    tmp_path,
+):
+    text = """
+from stad_lab import Config
+from stad_lab.evaluation.evaluate import evaluate
+from stad_lab.training.pipeline import train
+config = Config.preset("quick", data={"episodes": 2, "episode_frames": 30})
+print(train(config, "run", until="dataset"))
+evaluate("input", 2)
+"""
+    process = run_script(tmp_path, text)
+    assert process.stdout.splitlines()[-1:] == ["True"], process.stderr
     lines = process.stderr.splitlines()
     assert process.returncode == 1
     assert "script.py would run again in every worker process: put what it does below" in lines[-1]
     assert 'if __name__ == "__main__":' in lines[-1]
     assert process.stderr.count("Traceback") == 1 and "BrokenProcessPool" not in process.stderr
-
-
-def test_a_script_without_a_main_guard_may_train(tmp_path):
-    text = """
-from stad_lab import Config
-from stad_lab.training.pipeline import train
-config = Config.preset("quick", data={"episodes": 2, "episode_frames": 30})
-print(train(config, "run", until="dataset"))
-"""
-    process = run_script(tmp_path, text)
-    assert process.stdout.splitlines()[-1:] == ["True"], process.stderr
 
 
 ANOTHER = """

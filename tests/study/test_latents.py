@@ -51,7 +51,7 @@ def measured(quick_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("study")
     command = ["latents", "--preset", "quick", "--out", folder, "--parts", "mdn_rnn"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(latents, "DREAMERS", 6)
+        patch.setattr(latents, "DREAMERS", 2)
         patch.setattr(latents, "VARIANTS", ("frame", "input"))
         assert main([*map(str, command), "--dataset", str(quick_run / "dataset")]) == 0
     return folder

@@ -23,7 +23,12 @@ from stad_study.run import EVALUATION, describe_time, keep, replicate
 
 BRIEF = {"generations": 2, "max_frames": 30}
 FIRST = Config.preset(
-    "quick", variant="input", processes=1, vae={"steps": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF
+    "quick",
+    variant="input",
+    processes=1,
+    vae={"steps": 8, "batch": 8},
+    mdn_rnn={"steps": 4},
+    evolution=BRIEF,
 )
 SECOND = FIRST.replace(data={"agent_episodes": 2}, evolution={"generations": 4, "components": 8})
 TUNED = SECOND.replace(evolution={"generations": 2, "tracks": 2, "sigma": 0.02})

@@ -32,7 +32,7 @@ from stad_study.study import (
 from stad_study.study_probe import probe_study
 
 BRIEF = {"generations": 4, "max_frames": 30, "components": 8}
-CONFIG = Config.preset("quick", vae={"steps": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)
+CONFIG = Config.preset("quick", vae={"steps": 8, "batch": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)
 VARIANTS = ("frame", "input_output")
 TINY = Study((0, 1), VARIANTS, config=CONFIG, tracks=range(1000, 1018), max_frames=40)
 

@@ -69,7 +69,8 @@ def test_the_comparison_waits_for_the_last_run(tmp_path):
 def quick(generations):
     """A budget of seconds."""
     evolution = {"generations": generations, "validate_every": 2, "max_frames": 15}
-    return Config.preset("quick", processes=1, evolution=evolution)
+    trained = {"vae": {"steps": 4}, "mdn_rnn": {"steps": 2}}
+    return Config.preset("quick", processes=1, evolution=evolution, **trained)
 
 
 def test_a_run_continues_from_the_log_that_is_kept_of_it(tmp_path, monkeypatch, capsys):

@@ -12,10 +12,11 @@ from stad_lab.training.fine_tuning import FINE_TUNING
 from stad_study import study4, tables
 from stad_study.cli import main
 from stad_study.experiments import EXPERIMENTS
+from stad_study.study import STUDIES
 from stad_study.study4 import Run, add_run, find_runs, run_study4
 
 BRIEF = {"generations": 2, "validate_every": 1, "max_frames": 20}
-FIRST = Config.preset("quick", vae={"steps": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)
+FIRST = Config.preset("quick", vae={"steps": 8, "batch": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)
 FIRST = FIRST.replace(variant="frame", data={"crop_bar": False})
 SECOND = FIRST.replace(data={"agent_episodes": 2})
 TUNED = SECOND.replace(evolution={"generations": 2, "population": 4, "tracks": 2, "sigma": 0.02})
@@ -32,6 +33,8 @@ def brief():
         patch.setitem(EXPERIMENTS, "fine_tuned_frame", dataclasses.replace(tuned, config=TUNED))
         patch.setattr(study4, "VALIDATION", 2)
         patch.setattr(study4, "TRACKS", range(6000, 6003))
+        short = dataclasses.replace(STUDIES["study1"], max_frames=40)
+        patch.setitem(STUDIES, "study1", short)
         yield
 
 

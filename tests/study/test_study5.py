@@ -213,7 +213,7 @@ def test_of_two_processes_one_prepares_a_seed_and_the_other_waits(
 
 
 def test_the_pilot_of_the_erasure_is_one_command(capsys, monkeypatch):
-    monkeypatch.setattr(world_facts.measure_erasure, "__defaults__", (36, 2))
+    monkeypatch.setattr(world_facts.measure_erasure, "__defaults__", (12, 2))
     monkeypatch.setattr(probe_run, "AGENT_FRAMES", 360)
     assert main(["erasure", "cropped_input_output"]) == 0
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
