@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+import scipy  # loads scipy.stats, which takes a second, where it is used
 
 SOLVED = 900  # points; CarRacing counts as solved at a mean return of 900 over 100 tracks
 FAILED = 800  # points; an episode below has left the road or missed tiles
@@ -53,7 +53,7 @@ def count_draws(drawn: np.ndarray, count: int) -> np.ndarray:
 
 def paired_p(differences: Sequence[float] | np.ndarray) -> float:
     """Two-sided p-value of the paired t-test, from the difference of each pair."""
-    return float(stats.ttest_1samp(differences, 0.0).pvalue)
+    return float(scipy.stats.ttest_1samp(differences, 0.0).pvalue)
 
 
 def equivalence_p(differences: Sequence[float] | np.ndarray, margin: float) -> float:
@@ -61,15 +61,15 @@ def equivalence_p(differences: Sequence[float] | np.ndarray, margin: float) -> f
 
     It is below 0.05 if Student's 90% interval lies within the margin (Schuirmann 1987).
     """
-    above = stats.ttest_1samp(differences, -margin, alternative="greater").pvalue
-    below = stats.ttest_1samp(differences, margin, alternative="less").pvalue
+    above = scipy.stats.ttest_1samp(differences, -margin, alternative="greater").pvalue
+    below = scipy.stats.ttest_1samp(differences, margin, alternative="less").pvalue
     return float(max(above, below))
 
 
 def mean_interval(values: Sequence[float] | np.ndarray, outside: float = 0.05) -> list[float]:
     """Student's interval of the mean of two values or more; half of `outside` on each side."""
-    error = stats.sem(values)
-    ends = stats.t.ppf([outside / 2, 1 - outside / 2], len(values) - 1)
+    error = scipy.stats.sem(values)
+    ends = scipy.stats.t.ppf([outside / 2, 1 - outside / 2], len(values) - 1)
     return [float(np.mean(values) + t * error) for t in ends]
 
 
@@ -84,7 +84,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 def interquartile_mean(values: np.ndarray) -> float:
     """Mean of the values without the lowest and the highest quarter."""
-    return float(stats.trim_mean(values, 0.25, axis=None))
+    return float(scipy.stats.trim_mean(values, 0.25, axis=None))
 
 
 def pairs_that_decide(deviation: float, margin: float, tests: int) -> int:
@@ -96,7 +96,7 @@ def pairs_that_decide(deviation: float, margin: float, tests: int) -> int:
     number below 100,000.
     """
     for pairs in range(2, 100_000):
-        both = stats.t.ppf([0.975, 1 - 0.025 / tests], pairs - 1).sum()
+        both = scipy.stats.t.ppf([0.975, 1 - 0.025 / tests], pairs - 1).sum()
         if both * deviation / np.sqrt(pairs) <= margin:
             return pairs
     raise ValueError(f"deviation={deviation}: 100,000 pairs would not decide")

@@ -17,8 +17,8 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from stad_lab.config import VARIANTS
+from stad_lab.envs.state import MOTION
 from stad_lab.evaluation.statistics import SOLVED
-from stad_lab.evaluation.trajectories import MOTION
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY = "#CC79A7", "#56B4E9"
