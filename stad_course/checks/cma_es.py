@@ -112,7 +112,7 @@ def expected_bests(expected_best: Callable) -> None:
     dice = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     mistakes = {
         "this is the mean of the samples, not of their largest: take the largest of each": 3.5,
-        "this is the largest of all: take the mean over many notes": 6.0,
+        "this is the largest of all: take the mean over many samples": 6.0,
         "without replacement: put the die back before you throw again": 14 / 3,
         "this is the mean of the smallest: take the largest": 91 / 36,
     }
@@ -122,7 +122,7 @@ def expected_bests(expected_best: Callable) -> None:
     what = "expected_best of one die"
     mistakes = {
         "size is not used: sample `size` of the returns": 161 / 36,
-        "this is the largest of all: take the mean over many notes": 6.0,
+        "this is the largest of all: take the mean over many samples": 6.0,
     }
     found = ask(what, expected_best, dice, 1, np.random.default_rng(0))
     check(what, found, 3.5, mistakes, tolerance=0.02)

@@ -96,7 +96,7 @@ def moments_of_mixtures(moments: Callable) -> None:
         "the parts lie apart, and that is missing: add the variance of their means": within.sqrt(),
         "deviations were averaged, and the spread of the means is missing: add variances": (mixed),
         "the parts are wide, and that is missing: add their mean variance": between.sqrt(),
-        "the squares are not weighed: use pi = exp(logpi)": (within + unweighed).sqrt(),
+        "the squares are not weighted: use pi = exp(logpi)": (within + unweighed).sqrt(),
         "a standard deviation was taken for a variance: that is its square, exp(2 * logsigma)": (
             mixed + between
         ).sqrt(),
@@ -110,7 +110,7 @@ def moments_of_mixtures(moments: Callable) -> None:
         wrong = "moments must return two tensors"
         raise WrongAnswer("moments", wrong, "return mean, standard deviation")
     weigh = "use pi = exp(logpi)"
-    centers = {f"the means are not weighed: {weigh}": mean.mean(-1)}
+    centers = {f"the means are not weighted: {weigh}": mean.mean(-1)}
     centers[f"logpi, which is negative, was taken as the weight: {weigh}"] = (logpi * mean).sum(-1)
     check("the mean", found[0], both.mean, centers)
     check("the standard deviation", found[1], both.stddev, mistakes)
@@ -175,7 +175,7 @@ def horizon_intervals(horizon_interval: Callable) -> None:
     hard = source.gamma(2.0, 0.5, (15, 1))  # on a hard episode both errors are large
     grown = hard * source.gamma(4.0, 0.25, (15, 1)) * np.linspace(0.1, 2.5, 60)
     bounds = {
-        "the constant's errors are of the same episodes: draw them along": (18, 44.5),
+        "the constant's errors are of the same episodes: resample them together": (18, 44.5),
         "both errors of an episode belong together: sample the episodes once, for both": (16, 48.5),
     }
     dream = grown + 0.1 * source.standard_normal((15, 60))
