@@ -46,11 +46,11 @@ def one_thread():
 
 
 def pytest_xdist_auto_num_workers():
-    """Two processes more than cores: many tests wait for a browser, a kernel or a command.
+    """One process more than cores, because many tests wait for a browser, a kernel or a command.
 
     There are at most 4: a laptop's memory holds no more.
     """
-    return min(4, os.cpu_count() + 2)
+    return min(4, os.cpu_count() + 1)
 
 
 def run_stad_lab(*arguments, **environment):
