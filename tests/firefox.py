@@ -22,7 +22,8 @@ class Firefox:
         )
         self.number = 0
         self.call("session.new", capabilities={})
-        self.tab = self.call("browsingContext.getTree")["contexts"][0]["context"]
+        # On a busy machine Firefox opens its start page late, and in the first tab.
+        self.tab = self.call("browsingContext.create", type="tab")["context"]
 
     def call(self, method, **parameters):
         """One command; returns its result."""
