@@ -43,7 +43,7 @@ stad.Hand = class {
 };
 
 {
-  stad.PEDAL_KEYS = {
+  const KEYS = {
     ArrowLeft: "left",
     ArrowRight: "right",
     ArrowUp: "gas",
@@ -53,6 +53,7 @@ stad.Hand = class {
     KeyW: "gas",
     KeyS: "brake",
   };
+  stad.PEDAL_KEYS = KEYS;
 
   /**
    * Let keys and buttons drive.
@@ -85,7 +86,7 @@ stad.Hand = class {
       if (!seat.contains(event.target) && !drives()) return;
       if (event.ctrlKey || event.altKey || event.metaKey) return;
       const pressed = event.key === " " || event.key === "Enter";
-      const pedal = stad.PEDAL_KEYS[event.code] ?? (pressed ? event.target.dataset?.pedal : undefined);
+      const pedal = KEYS[event.code] ?? (pressed ? event.target.dataset?.pedal : undefined);
       if (!pedal || event.target.matches("input, select, textarea")) return;
       event.preventDefault(); // arrow keys would move the page
       if (!event.repeat) hold(event.code, pedal);

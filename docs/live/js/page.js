@@ -88,8 +88,10 @@ stad.get = (id) => document.getElementById(id);
 stad.forget = (root) => {
   for (const one of root.querySelectorAll("input"))
     [one.value, one.checked] = [one.defaultValue, one.defaultChecked];
-  for (const one of root.querySelectorAll("select"))
-    one.selectedIndex = Math.max(0, [...one.options].findIndex((option) => option.defaultSelected));
+  for (const one of root.querySelectorAll("select")) {
+    const chosen = [...one.options].findIndex((option) => option.defaultSelected);
+    one.selectedIndex = Math.max(0, chosen);
+  }
 };
 
 /** An output is a live region by itself: one that changes 50 times a second must not be read. */
