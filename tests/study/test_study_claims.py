@@ -168,10 +168,12 @@ def test_the_secondary_outcomes_of_an_arm_are_those_of_its_episodes(found, full)
     assert arm["tenth_percentile"] == np.percentile(flat, 10)
     assert arm["interquartile_mean"] == pytest.approx(flat[1200:3600].mean())
     # 100, 300, 500 at equal distances: the mean height is 300, more by the gain and the seed.
-    assert arm["area"] == pytest.approx(np.mean([300 - 60 + seed for seed in range(SEEDS)]))
+    curves = study_claims.learning_curves("study1", full)["z: output"]
+    areas = [300 - 60 + seed for seed in range(SEEDS)]
+    assert study_claims.area_under(*curves) == pytest.approx(areas)
+    assert arm["area"] == pytest.approx(np.mean(areas))
     assert found["comparisons"]["z: output"]["area_difference"] == pytest.approx(-60)
-    curves = study_claims.learning_curves("study1", full)
-    curve = study_claims.over_episodes(*curves["z: output"])
+    curve = study_claims.over_episodes(*curves)
     assert curve["episodes"] == [1060, 1220, 1380]
     assert curve["mean"] == pytest.approx([45.5, 245.5, 445.5])
 
