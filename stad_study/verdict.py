@@ -52,15 +52,15 @@ def describe_interaction(one: dict) -> str:
 def describe_repetition(one: dict) -> str:
     """Whether the two effects differ in part 5a of study 5, whose interaction this is."""
     low, high = one["interval"]
-    text = "Planned: with three new controllers for each V and M, the two differences are"
-    text += f" {one['difference']:.1f} points apart"
+    text = "Planned after study 1: with three new controllers for each V and M, the two"
+    text += f" differences are {one['difference']:.1f} points apart"
     return f"{text} ({low:.1f} to {high:.1f}; Holm's p = {one['holm_p']:.3f})."
 
 
 def describe_ceiling(study: dict) -> str:
     """Where the gain of the paper was out of reach, for the overview; else nothing."""
     seen = [name.replace(", ", " and ") for name in SEES if out_of_reach(study, name)]
-    return f"With {' or '.join(seen)} the paper's gain was out of reach." if seen else ""
+    return f"With {' or '.join(seen)} the paper's gain was not possible." if seen else ""
 
 
 def describe_others(study: dict) -> str:
@@ -91,9 +91,11 @@ def describe_paper_gain(study: dict) -> str:
         if out_of_reach(study, features):
             baseline = study["arms"][f"{features}: frame"]["mean"]
             seen, best = features.replace(", ", " and "), f"{study['ceiling']:.0f}"
-            text += f" With {seen} such gains were out of reach: `frame` has"
-            text += f" {baseline:.0f} points, and the best of all pipelines on each track has"
-            text += f" {best} on average (computed afterwards)."
+            text += f" With {seen} such gains were out of reach of this recipe: `frame` has"
+            text += (
+                f" {baseline:.0f} points, {low:.0f} more are {baseline + low:.0f}, and the best of"
+            )
+            text += f" all pipelines on each track has {best} on average (computed afterwards)."
     return text
 
 

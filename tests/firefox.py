@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import time
 
 import pytest
 
@@ -35,8 +36,13 @@ class Firefox:
         return answer["result"]
 
     def open(self, address):
-        """Open a page."""
-        self.call("browsingContext.navigate", context=self.tab, url=address, wait="complete")
+        """Open a page. On a busy machine a new tab's blank page comes late, and in its place."""
+        deadline = time.monotonic() + 60
+        while True:
+            self.call("browsingContext.navigate", context=self.tab, url=address, wait="complete")
+            if (found := self.evaluate("() => location.href")) == address:
+                return
+            assert time.monotonic() < deadline, found
 
     def reload(self):
         """Open the page again, as its reader does: Firefox keeps what the controls say."""

@@ -79,7 +79,7 @@ stad.start(async () => {
     xMax: count,
     yMax: 1000,
     xLabel: "generation",
-    yLabel: "return",
+    yLabel: "points",
   });
 
   // The dream
