@@ -102,7 +102,7 @@ def gains(claims: dict) -> str:
         told.append(f"{name_verdict(one)} ({points})")
     both, alone = told
     if out_of_reach(study, "z, h"):
-        both += "; the paper's gain was not possible"
+        both += "; the paper's gain was out of reach"
     return (
         "Does it help to see and reconstruct what has moved? A paper says so. We trained each"
         f" kind twelve times. With a memory, as the paper's controller probably has it: {both}."

@@ -60,7 +60,7 @@ def describe_repetition(one: dict) -> str:
 def describe_ceiling(study: dict) -> str:
     """Where the gain of the paper was out of reach, for the overview; else nothing."""
     seen = [name.replace(", ", " and ") for name in SEES if out_of_reach(study, name)]
-    return f"With {' or '.join(seen)} the paper's gain was not possible." if seen else ""
+    return f"With {' or '.join(seen)} the paper's gain was out of reach." if seen else ""
 
 
 def describe_others(study: dict) -> str:
@@ -92,10 +92,9 @@ def describe_paper_gain(study: dict) -> str:
             baseline = study["arms"][f"{features}: frame"]["mean"]
             seen, best = features.replace(", ", " and "), f"{study['ceiling']:.0f}"
             text += f" With {seen} such gains were out of reach of this recipe: `frame` has"
-            text += (
-                f" {baseline:.0f} points, {low:.0f} more are {baseline + low:.0f}, and the best of"
-            )
-            text += f" all pipelines on each track has {best} on average (computed afterwards)."
+            text += f" {baseline:.0f} points, {low:.0f} more are {baseline + low:.0f}, and the"
+            text += f" best of all pipelines on each track has {best} on average (computed"
+            text += " afterwards)."
     return text
 
 
