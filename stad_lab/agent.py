@@ -42,8 +42,11 @@ class Agent:
 
     Args:
         world_model: V and M.
-        parameters: of C, (parameters,), or one row for each car (cars, parameters).
+        parameters: of C, float (parameters,), or one row for each car (cars, parameters).
         remembers: whether M updates its memory; a C that does not see h drives the same without.
+
+    Raises:
+        ValueError: parameters of another shape, or not finite.
     """
 
     def __init__(self, world_model: WorldModel, parameters: np.ndarray, remembers: bool = True):
@@ -100,7 +103,7 @@ class Agent:
         `act` does it with its own actions. A driver that changes them calls this again.
 
         Args:
-            before: `state` as it was before that `act`.
+            before: `state` as it was before that `act`; None before an episode's first.
         """
         self._check_acted()
         if before is None:
@@ -264,10 +267,12 @@ def load_agent(source: str | Path, controller: str | Path | None = None) -> Agen
     """Load a trained agent.
 
     Args:
-        source: "frame", "input", "output" or "input_output" for the shipped agents, which are of
-            one recipe (but the second iteration of "input" replayed no hard tracks); the name of
-            another shipped agent; or the folder of a run, as a Path where it could be such a name.
+        source: the name of a shipped agent, see `shipped_agents`; or the folder of a run, as a
+            Path where it could be such a name.
         controller: a file of another C for this V and M, as the browser saves it; None: its own.
+
+    Returns:
+        The agent, as before its first observation.
 
     Raises:
         FileNotFoundError: no such agent or file, or the agent's run is not finished.

@@ -54,7 +54,10 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
         draw_margin(axis, margin)
         axis.axvline(reported, color="black", linestyle="--", label=paper)
         for height, variant in enumerate(variants):
-            plot_comparison(axis, height, comparisons[f"{features}: {variant}"], COLOURS[variant])
+            one = comparisons[f"{features}: {variant}"]
+            plot_comparison(axis, height, one, COLOURS[variant])
+            beside = axis.get_yaxis_transform()
+            axis.text(1.01, height, one["verdict"], transform=beside, va="center", fontsize=9)
         name_rows(axis, variants)
         axis.set_title(title, loc="left", fontsize=10)
     axes[1, 0].set_xlabel("mean return minus that of frame with the same seed, points")

@@ -43,17 +43,19 @@ def name_verdict(one: dict) -> str:
 
 
 def describe_interaction(one: dict) -> str:
-    """Whether the two effects differ; the protocol has no such test."""
+    """How far the two effects are apart; the protocol has no such test."""
     significant = "significant" if one["p"] < LEVEL else "not significant"
-    text = f"Computed afterwards: the two differences are {one['difference']:.1f} points apart,"
-    return f"{text} which is {significant} (p = {one['p']:.3f})."
+    apart = f"The two differences are {one['difference']:.1f} points apart"
+    return f"{apart}: {significant} (p = {one['p']:.3f}, computed afterwards)."
 
 
 def describe_repetition(one: dict) -> str:
-    """Whether the two effects differ in part 5a of study 5, whose interaction this is."""
+    """How far they are apart in part 5a of study 5, whose interaction this is."""
     low, high = one["interval"]
-    text = "Planned after study 1: with three new controllers for each V and M, the two"
-    text += f" differences are {one['difference']:.1f} points apart"
+    text = (
+        "[Study 5a](#is-it-the-motion), planned later, with three new controllers for each of the"
+    )
+    text += f" same V and M: {one['difference']:.1f} points"
     return f"{text} ({low:.1f} to {high:.1f}; Holm's p = {one['holm_p']:.3f})."
 
 
@@ -66,8 +68,11 @@ def describe_ceiling(study: dict) -> str:
 def describe_others(study: dict) -> str:
     """That no other variant has a gain, for the overview; else nothing."""
     others = [one for name, one in study["comparisons"].items() if "input_output" not in name]
-    gained = any(one["verdict"] == "gain" for one in others)
-    return "" if gained else "`input` and `output` show no gain."
+    verdicts = [one["verdict"] for one in others]
+    if "gain" in verdicts:
+        return ""
+    undecided = f"{verdicts.count('undecided')} of {len(verdicts)} undecided"
+    return f"`input` and `output`: no gain, {undecided}."
 
 
 def out_of_reach(study: dict, features: str) -> bool:

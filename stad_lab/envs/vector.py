@@ -94,7 +94,7 @@ class CarRacingVector(gym.vector.VectorEnv):
                 for `CarRacing.reset`.
 
         Returns:
-            Observations, uint8 (num_envs, 96, 96, 3), and {}.
+            Observations, of `observation_space`, and {}.
         """
         self._check_open()
         options = check_options(options)
@@ -117,7 +117,7 @@ class CarRacingVector(gym.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Drive all cars one frame; see Gymnasium's VectorEnv for what is returned.
+        """Drive all cars `frame_skip` frames; see Gymnasium's VectorEnv for what is returned.
 
         Raises:
             ValueError: actions of another shape, not finite, or not one of the five.

@@ -51,7 +51,7 @@ def evaluate(
         episodes: number of tracks, each driven once, to its end.
         fast: render with the fast renderer instead of Gymnasium's own.
         processes: processes, or threads if `fast`; the numbers do not depend on them.
-        executor: who drives; None for so many workers of this machine.
+        executor: where episodes run; None for so many workers of this machine.
         unfinished: file that keeps what was driven, so that an interrupted evaluation continues.
 
     Returns:

@@ -77,7 +77,7 @@ class MDNRNN(nn.Module):
 
     @classmethod
     def of(cls, config: Any) -> "MDNRNN":
-        """The M of a run's `Config`; a setting of the architecture needs no other place."""
+        """The M of a run's `Config`."""
         sizes = config.mdn_rnn.hidden_size, config.mdn_rnn.mixtures
         return cls(config.vae.latent_size, *sizes)
 

@@ -34,7 +34,7 @@ class VAE(nn.Module):
     Args:
         variant: one of DIFFERENCE.
         latent_size: dimensions of z.
-        width: channels of the first convolution (World Models: 32).
+        width: channels of the first convolution (World Models: 32; `Config` has 16).
     """
 
     def __init__(self, variant: str, latent_size: int = 32, width: int = 32):
@@ -69,13 +69,18 @@ class VAE(nn.Module):
 
     @classmethod
     def of(cls, config: Any) -> "VAE":
-        """The V of a run's `Config`; a setting of the architecture needs no other place."""
+        """The V of a run's `Config`."""
         return cls(config.variant, config.vae.latent_size, config.vae.width)
 
     def encode(
         self, frame: torch.Tensor, difference: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """q(z | x) = N(mu, exp(logvar)): mu and logvar, (batch, latent_size) each."""
+        """q(z | x) = N(mu, exp(logvar)): mu and logvar, (batch, latent_size) each.
+
+        Args:
+            frame: float32 (batch, 3, 64, 64) in [0, 1].
+            difference: the same in [-1, 1]; ignored by a V that does not see it.
+        """
         seen = torch.cat([frame, difference], 1) if self.sees_difference else frame
         mu, logvar = self.encoder(seen).chunk(2, dim=1)
         return mu, soft_bound(logvar, *LOGVAR_RANGE)
@@ -91,7 +96,7 @@ class VAE(nn.Module):
     def reconstruct(
         self, frame: torch.Tensor, difference: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Encode and decode through the mean mu, without sampling."""
+        """Encode and decode through the mean mu, without sampling: shapes as of both."""
         return self.decode(self.encode(frame, difference)[0])
 
 
@@ -159,9 +164,13 @@ def vae_losses(
     free_bits: float = 0.0,
     difference_weight: float = 1.0,
 ) -> dict[str, torch.Tensor]:
-    """The loss of V ("total"), and each of its terms; means over the batch.
+    """The loss of V, "total", and its terms; means over the batch.
+
+    "frame_error" and, if it is reconstructed, "difference_error" are squared errors, summed over a
+    picture; "kl" is in nats.
 
     Args:
+        frame, difference: as for `VAE.encode`.
         noise: N(0, 1), (batch, latent_size).
         kl_weight: weight of the KL term.
         free_bits: nats for each latent below which a picture's KL is not penalised (Kingma et al.

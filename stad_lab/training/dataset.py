@@ -107,7 +107,7 @@ def collect(config: Config, folder: Path, executor: Executor | None = None) -> b
     """Collect the random driver's missing episodes into `folder`; False if there are none.
 
     Args:
-        executor: who drives; None for `config.processes` threads of this machine.
+        executor: where episodes run; None for `config.processes` threads of this machine.
 
     Raises:
         ValueError: the folder holds a dataset of another configuration.

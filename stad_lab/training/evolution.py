@@ -73,7 +73,7 @@ def evolve(
     kept: to keep the best *candidate* would be to keep the one with the easiest tracks.
 
     Args:
-        executor: who drives; None for `config.processes` threads of this machine.
+        executor: where episodes run; None for `config.processes` threads of this machine.
         watch: called with the log's generations after each, and when a run is resumed.
         drives: what drives instead of the V and M in `folder`; on this machine alone.
 

@@ -77,7 +77,7 @@ def train(
         folder: of the run; made if missing.
         dataset_folder: where the dataset is, or goes; None for `folder/dataset`.
         until: the last stage, one of STAGES.
-        executor: who drives; None for `config.processes` threads of this machine.
+        executor: where episodes run; None for `config.processes` threads of this machine.
         earlier: in a second iteration, the folder of the run whose agent drives
             `data.agent_episodes` for the dataset, and whose C is carried over.
         watch: told what the stages "vae", "mdn_rnn" and "controller" have logged, as it grows.
