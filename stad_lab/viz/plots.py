@@ -181,7 +181,7 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
     axis.axhline(1, color="black", lw=1, ls="--", label="uniform")
     scaled = {name: share * len(share) for name, share in shares.items()}
     lowest = min(0.8, *(own.min() - 0.05 for own in scaled.values()))
-    axis.set(xlabel=xlabel, ylabel="density (not from 0)", ylim=(lowest, None))
+    axis.set(xlabel=xlabel, ylabel="height of a bin (axis not from 0)", ylim=(lowest, None))
     axis.legend(**SMALL)
     ranges = [f"{name} {min(own):.2g} to {max(own):.2g}" for name, own in scaled.items()]
     return describe(figure, title, "Histograms relative to uniform, 1: ", ranges)
