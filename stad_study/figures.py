@@ -73,8 +73,8 @@ def plot_study(comparisons: dict[str, dict], margin: float, reported: float) -> 
 
 
 def draw_margin(axis: Axes, margin: float) -> None:
-    """The band of a forest plot in which differences are not relevant, and its zero line."""
-    axis.axvspan(-margin, margin, color="0.92", label=f"not relevant: within {margin} points")
+    """The band of a forest plot within the margin, and its zero line."""
+    axis.axvspan(-margin, margin, color="0.92", label=f"margin: {margin} points")
     axis.axvline(0, color="black", linewidth=0.8)
 
 
@@ -210,8 +210,8 @@ def plot_primary(comparisons: dict[str, dict], margin: float) -> Figure:
     for height, one in enumerate(primary.values()):
         plot_comparison(axis, height, one, COLOURS["input_output"])
     name_rows(axis, primary)
-    axis.set_xlabel("points more or less than without difference images")
+    axis.set_xlabel("points more or less than frame")
     legend_below(figure, axis)
     told = [f"{seen} {difference_of(one)}, {one['verdict']}" for seen, one in primary.items()]
     lead = f"Means of {len(one['by_seed'])} seeds with 95% intervals: "
-    return describe(figure, "What difference images change", lead, ["; ".join(told)])
+    return describe(figure, "input_output minus frame", lead, ["; ".join(told)])

@@ -29,11 +29,11 @@ def describe_verdict(study: dict) -> list[str]:
 def describe_comparison(features: str, one: dict) -> str:
     """The verdict of one primary comparison, with its interval."""
     points, (low, high) = one["difference"], one["interval"]
-    text = f"If C sees {SEES[features]}, `input_output` minus `frame` is {points:+.1f} points"
-    text += f" (95% interval {low:.1f} to {high:.1f}): {name_verdict(one)}"
+    text = f"If C sees {SEES[features]}: {name_verdict(one)} (`input_output` minus `frame` is"
+    text += f" {points:+.1f} points, 95% interval {low:.1f} to {high:.1f}"
     if one["verdict"] == "undecided":
         text += f"; {one['seeds_that_decide']} seeds would decide"
-    return text + "."
+    return text + ")."
 
 
 def name_verdict(one: dict) -> str:
@@ -83,17 +83,20 @@ def out_of_reach(study: dict, features: str) -> bool:
 
 def describe_paper_gain(study: dict) -> str:
     """How many intervals end below the gain of the paper, and where none could reach it."""
-    comparisons = study["comparisons"]
+    reached = [features for features in SEES if not out_of_reach(study, features)]
     below = [
         one["interval"][1] < PAPER_GAINS[name.partition(": ")[2]]
-        for name, one in comparisons.items()
+        for name, one in study["comparisons"].items()
+        if name.partition(": ")[0] in reached
     ]
     count = f"all {len(below)}" if all(below) else f"{sum(below)} of the {len(below)}"
+    count += " intervals with z alone" if reached == ["z"] else " intervals"
     low, high = min(PAPER_GAINS.values()), max(PAPER_GAINS.values())
     text = f"The paper reports gains of {low:.0f} to {high:.0f} points, on CarRacing-v0 and with"
-    text += f" another recipe. Here, on v3, {count} intervals end below them."
+    text += " another recipe."
+    text += f" Here, on v3, {count} end below them." if reached else ""
     for features in SEES:
-        if out_of_reach(study, features):
+        if features not in reached:
             baseline = study["arms"][f"{features}: frame"]["mean"]
             seen, best = features.replace(", ", " and "), f"{study['ceiling']:.0f}"
             text += f" With {seen} such gains were out of reach of this recipe: `frame` has"
