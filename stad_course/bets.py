@@ -17,8 +17,8 @@ def deal(scores: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, int]
     They are points more than the mean of all four: their level would betray the variant.
 
     Args:
-        scores: of each run of two variants, (2, runs). B has the other variant in half of all
-            rounds; which one A has is chosen, too.
+        scores: of each run of two variants, (2, runs), at least 4 runs. B has the other variant in
+            half of all rounds; which one A has is chosen, too.
         rng: chooses the runs.
     """
     first, other = rng.integers(2, size=2)
@@ -28,7 +28,7 @@ def deal(scores: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, int]
 
 
 def best_rule(scores: np.ndarray, rounds: int = 20_000) -> tuple[float, float]:
-    """The lead from which "two variants" is the better bet, and the share of rounds it wins."""
+    """The lead, in points, from which to bet on "two variants", and the share of rounds won."""
     rng = np.random.default_rng(0)
     dealt = [deal(scores, rng) for _ in range(rounds)]
     leads = np.abs([np.subtract(*runs.mean(axis=1)) for runs, _ in dealt])
@@ -55,7 +55,7 @@ class TwoRuns(ipywidgets.VBox):
     """A bet in every round: do A and B have one variant, or two?
 
     Args:
-        scores: of each run of two variants, (2, runs).
+        scores: of each run of two variants, (2, runs), at least 4 runs.
     """
 
     def __init__(self, scores: np.ndarray):

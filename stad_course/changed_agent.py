@@ -11,7 +11,7 @@ Change = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class ChangedAgent:
-    """Drives as an agent, but `change` makes other actions of its own.
+    """A driver for `rollout`: an agent whose actions `change` replaces.
 
     Args:
         agent: at the start of its episodes.

@@ -140,7 +140,7 @@ def check_packages() -> Iterator[Line]:
 
 
 def check_extras() -> Iterator[Line]:
-    """What the extras lack that no notebook needs; one that is wholly absent is not wanted."""
+    """Which extras beyond NEEDED are incomplete; one that is wholly absent gives a green line."""
     for extra in metadata("stad_lab").get_all("Provides-Extra") or ():
         if extra in NEEDED:
             continue

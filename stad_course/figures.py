@@ -55,7 +55,11 @@ def plot_mixture(
     temperatures: list[float],
     actual: float | None = None,
 ) -> Figure:
-    """The density of a mixture, each array (mixtures,), at some temperatures."""
+    """The density of a mixture, each array (mixtures,), at some temperatures.
+
+    A single temperature also shows the parts, and one Gaussian of the same mean and variance.
+    `actual` is the true value.
+    """
     figure, ((axis,),) = new_figure(6.5, 3.4)
     reach = 4 * np.exp(logsigma) * np.sqrt(max(temperatures))
     z = np.linspace((mean - reach).min(), (mean + reach).max(), 600)

@@ -1,4 +1,4 @@
-"""Drives seen from above: where each car of a batch went, what it scored, and figures of it."""
+"""Episodes seen from above: where each car of a batch went, what it scored, and figures of it."""
 
 from collections.abc import Iterable
 from itertools import chain
@@ -52,6 +52,9 @@ def drive(
     Args:
         tracks: n seeds.
         max_frames, patience: of `rollout`.
+
+    Raises:
+        ValueError: not as many tracks as controllers, or none.
     """
     if len(controllers) != len(tracks):
         raise ValueError(f"{len(controllers)} controllers on {len(tracks)} tracks: expected pairs")

@@ -127,7 +127,7 @@ def quiz(*questions: tuple[str, list[Option], int]) -> HTML:
 def recorded_networks(folder: Path) -> tuple[list[dict], np.ndarray, np.ndarray]:
     """The V networks of the page on the KL weight, and what they make of the same frames.
 
-    Returns facts of each network, frames uint8 (frames, 64, 64, 3), and the reconstructions uint8
+    Returns each network's metadata, frames uint8 (frames, 64, 64, 3), and the reconstructions uint8
     (networks, frames, 64, 64, 3). `docs/live/record_nat.py` trains and records them.
     """
     facts = json.loads((folder / "nat.json").read_text(encoding="utf-8"))

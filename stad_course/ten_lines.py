@@ -30,7 +30,7 @@ def yours_or_ours(their_ask: Ask, their_tell: Tell) -> tuple[Ask, Tell]:
 
 
 def run(own: Callable, *arguments: object, shape: tuple) -> tuple[np.ndarray, str]:
-    """What a reader's function returns, as float64, and what is wrong with its kind, or ""."""
+    """The float64 result of a reader's function, and what is wrong in type or shape, or ""."""
     nothing = np.empty(0)
     try:
         found = own(*arguments)

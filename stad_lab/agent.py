@@ -46,7 +46,7 @@ class Agent:
         remembers: whether M updates its memory; a C that does not see h drives the same without.
 
     Raises:
-        ValueError: parameters of another shape, or not finite.
+        ValueError: parameters of another shape, or not finite; networks that `Inference` refuses.
     """
 
     def __init__(self, world_model: WorldModel, parameters: np.ndarray, remembers: bool = True):
@@ -68,7 +68,7 @@ class Agent:
         """The action for one car: observation uint8 (96, 96, 3) -> float32 (3,).
 
         Steering is in [-1, 1], gas and brake are in [0, 1]. ValueError for another shape or dtype,
-        or for an action that is not finite.
+        for an action that is not finite, or if the agent drives several cars.
         """
         return self.act_batch([to_frame(observation, self.world_model.crop_bar)])[0]
 
@@ -77,7 +77,8 @@ class Agent:
 
         Args:
             seen: observations, uint8 (cars, 96, 96, 3), or frames, uint8 (cars, 64, 64, 3), with
-                the bar cropped as V was trained. Their number changes only by `keep` or `reset`.
+                the bar cropped as V was trained; frames are not checked. Their number changes only
+                by `keep` or `reset`; ValueError for another number.
         """
         seen = numbers("seen", seen, "an observation of each car")
         self._check_count(len(seen) if seen.ndim == 4 else 0)
@@ -100,7 +101,8 @@ class Agent:
     def remember(self, actions: np.ndarray, before: np.ndarray | None) -> None:
         """Update M's memory with the last z and these actions, float32 (cars, 3).
 
-        `act` does it with its own actions. A driver that changes them calls this again.
+        `act` does it with its own actions. A driver that changes them calls this again. ValueError
+        before the first `act`.
 
         Args:
             before: `state` as it was before that `act`; None before an episode's first.
@@ -115,7 +117,10 @@ class Agent:
         return self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
 
     def keep(self, cars: np.ndarray) -> None:
-        """Continue with some of the present cars, by their indices, until the next reset."""
+        """Continue with some of the present cars, by their indices, until the next reset.
+
+        ValueError for an index that is not there or given twice, or before the first `act`.
+        """
         self._check_acted()
         cars = car_numbers(cars, len(self.cars))
         self.memory.keep(cars)
@@ -163,11 +168,11 @@ class EnvBatch:
         return len(self.envs)
 
     def draw(self, which: np.ndarray) -> np.ndarray:
-        """What some cars see."""
+        """What some cars see: uint8 (n, 96, 96, 3) from CarRacing."""
         return np.stack([self.observations[car] for car in which])
 
     def step(self, actions: np.ndarray, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Drive some cars one frame: their rewards, and whether their episodes have ended."""
+        """Drive cars one frame: rewards, float64 (n,), and whether episodes ended, bool (n,)."""
         rewards, ended = [], []
         for car, action in zip(which, actions, strict=True):
             self.observations[car], reward, terminated, truncated, _ = self.envs[car].step(action)
@@ -199,6 +204,9 @@ def rollout(
         max_frames: of an episode, at most 1,000 as in CarRacing.
         patience: maximum number of frames without a new tile; 0 for no limit.
         observe: called before every step with the numbers of the cars, what they see, and actions.
+
+    Raises:
+        ValueError: `max_frames` below 1, `patience` below 0, or one that is not whole.
     """
     max_frames = whole_number("max_frames", max_frames, 1)
     patience = whole_number("patience", patience)
@@ -231,9 +239,12 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
 
     Args:
         agent: its parameters are one vector, or one row for each track.
-        tracks: seeds of the tracks, at least 0.
+        tracks: seeds of the tracks, whole numbers from 0 on; one or more.
         fast: use our engine, which draws the agent's frames directly, not Gymnasium's environment.
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
+
+    Raises:
+        ValueError: no tracks, another seed, or as `rollout` and `Agent.act_batch`.
     """
     if not isinstance(tracks, Sequence | np.ndarray) or not np.size(tracks):
         raise ValueError(f"tracks={shown(tracks)}: expected the seed of at least one track")
@@ -254,7 +265,7 @@ def shipped_agents() -> list[str]:
 
 
 def run_folder(source: str | Path) -> Path:
-    """The folder of an agent: that of a shipped one by its name, or the folder of a run."""
+    """The folder of a shipped agent, by its name, or of a run. ValueError for another type."""
     if not isinstance(source, str | Path):
         raise ValueError(
             f"agent {shown(source)}: expected a shipped agent's name or a run's folder"

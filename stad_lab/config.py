@@ -147,7 +147,7 @@ class Config:
     """Everything that determines a run. The defaults are the `laptop` preset.
 
     Raises:
-        ValueError: a value of the wrong type or out of range; the message names it.
+        ValueError: a value of the wrong type, out of range, or that does not fit another one.
     """
 
     variant: Literal["frame", "input", "output", "input_output"] = "input_output"
@@ -174,6 +174,9 @@ class Config:
             name: "quick", "fast", "laptop" or "paper"; None reads the environment variable
                 STAD_LAB_PRESET, and takes "laptop" if that is not set.
             **changes: as for `replace`.
+
+        Raises:
+            ValueError: an unknown preset or field, or a value that `Config` refuses.
         """
         if name is None:
             name = os.environ.get(PRESET_VARIABLE) or "laptop"
@@ -183,7 +186,7 @@ class Config:
         return PRESETS[name].replace(**changes)
 
     def replace(self, **changes) -> "Config":
-        """A copy with other values, for example `replace(seed=1, vae={"stride": 2})`."""
+        """A copy with changes: `replace(seed=1, vae={"stride": 2})`. ValueError as `preset`."""
         return with_values(self, changes)
 
     def as_dict(self) -> dict:
@@ -192,12 +195,12 @@ class Config:
 
     @staticmethod
     def from_dict(values: dict) -> "Config":
-        """The inverse of `as_dict`; a missing field has its default, an unknown one is refused."""
+        """The inverse of `as_dict`; a missing field has its default. ValueError as `preset`."""
         return with_values(Config(), values)
 
 
 def with_values(base: Any, values: dict) -> Any:
-    """A copy of the dataclass `base` with the values of a nested dict."""
+    """A copy of the dataclass `base` with values of a nested dict. ValueError as `preset`."""
     known, changed = [one.name for one in dataclasses.fields(base)], {}
     if not isinstance(values, dict):
         raise ValueError(f"settings of type {type(values).__name__}: expected a dict")
@@ -211,7 +214,7 @@ def with_values(base: Any, values: dict) -> Any:
 
 
 def fields_of(config: Any, prefix: str = "") -> list[tuple[str, Any, Any]]:
-    """(dotted name, type, value) of every field, stage by stage."""
+    """(dotted name, type, value) of every field. ValueError for a stage of another type."""
     found = []
     for one in dataclasses.fields(config):
         name, value = prefix + one.name, getattr(config, one.name)
@@ -295,7 +298,7 @@ STREAMS = (
 
 
 def random_stream(purpose: str, seed: int, *numbers: int) -> np.random.Generator:
-    """The Generator of one purpose: equal arguments give equal numbers, others independent ones."""
+    """A Generator for one of STREAMS: equal arguments give equal numbers, others independent."""
     key = (STREAMS.index(purpose), *numbers)
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))
 
@@ -315,7 +318,10 @@ REPORTED_TRACKS, STUDY_TRACKS = range(100), range(1000, 1400)
 
 
 def track_seeds(use: str, count: int, seed: int = 0, *numbers: int) -> list[int]:
-    """Seeds of `count` tracks from the range of one use, drawn with a seed and further numbers."""
+    """Seeds of `count` tracks from the range of one use, drawn with a seed and further numbers.
+
+    A track may be drawn twice. ValueError for a use that is not in TRACK_RANGES.
+    """
     rng = random_stream("tracks", seed, list(TRACK_RANGES).index(use), *numbers)
     return rng.integers(*TRACK_RANGES[use], count).tolist()
 

@@ -14,7 +14,7 @@ CHUNK = 250  # frames that V encodes at once
 
 
 def chunks(frames: np.ndarray, earlier: np.ndarray) -> Iterator[list[torch.Tensor]]:
-    """What V sees of frames, uint8 (n, 64, 64, 3), and of the earlier ones, part by part."""
+    """Yield [frames, differences] for V, float32 (m, 3, 64, 64), from uint8 (n, 64, 64, 3)."""
     count = max(1, len(frames) // CHUNK)
     for pair in zip(np.array_split(frames, count), np.array_split(earlier, count), strict=True):
         yield [to_tensor(picture) for picture in to_pictures(*pair)]
@@ -40,7 +40,10 @@ def remember_episode(mdn_rnn: MDNRNN, latents: np.ndarray, actions: np.ndarray) 
 
 
 def features_of(world_model: WorldModel, frames: np.ndarray, actions: np.ndarray) -> np.ndarray:
-    """What C sees in an episode, z and the h before it: float32 (T, latent_size + hidden_size)."""
+    """What C sees in an episode, z and the h before it: float32 (T, latent_size + hidden_size).
+
+    `frames` are uint8 (T, 64, 64, 3), `actions` float32 (T, 3).
+    """
     latents = encode_episode(world_model.vae, frames, world_model.stride)[0]
     hidden = remember_episode(world_model.mdn_rnn, latents, actions)
     return np.concatenate([latents, hidden], axis=1)

@@ -22,7 +22,7 @@ def open_missing_streams() -> None:
 
 
 class Lasting:
-    """A text stream that leads nowhere from the first write on that fails.
+    """A text stream that discards everything after a write has failed.
 
     The terminal was closed, or the reader of a pipe has ended, as `| head -1` does.
     """

@@ -30,7 +30,7 @@ def whole_number(name: str, value: Any, least: int = 0, most: int | None = None)
 
 
 def finite_number(name: str, value: Any) -> float:
-    """The value as a float. ValueError unless it is a finite number."""
+    """The value as a float. ValueError unless it is a number between -1e300 and 1e300."""
     number = isinstance(value, int | float | np.integer | np.floating)
     if isinstance(value, bool) or not number or not abs(value) < 1e300 or not math.isfinite(value):
         raise ValueError(f"{name}={shown(value)}: expected a finite number")
@@ -38,7 +38,7 @@ def finite_number(name: str, value: Any) -> float:
 
 
 def numbers(name: str, value: Any, expected: str) -> np.ndarray:
-    """The value as an array of numbers. ValueError for anything else."""
+    """The value as an array of numbers or bools. ValueError for anything else."""
     try:
         found = np.asarray(value)
     except (ValueError, TypeError, RuntimeError):  # its parts differ in length, for example

@@ -65,7 +65,7 @@ def place_car(
     """Put the car on a tile of its track, moving; returns the observation there.
 
     Args:
-        env: from `make_env`, fast or not.
+        env: from `make_env`, fast or not, after a `reset`.
         tile, speed, turn, offset: as for `Cars.place`.
     """
     racing: Any = env.unwrapped
@@ -104,14 +104,18 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
     Args:
         render_mode: of `render()`, "human", "rgb_array" or "state_pixels": the window of
             Gymnasium, without skid marks; or None.
-        bar: whether to draw the indicator bar. Without it the lowest 12 rows are black.
+        bar: whether to draw the indicator bar. Without it the lowest 12 of 96 rows are black.
         continuous, lap_complete_percent, domain_randomize: as Gymnasium's.
         observes: "picture"; "state", float32 (10,), see `envs.state.STATE`; or "above", the whole
             track and the car from above.
         size: of a picture, pixels, 32 to 512. Our engine draws 96, Gymnasium's slower code others.
-        frame_skip: frames that a step repeats its action for; only the last is drawn. Gymnasium
-            limits an episode by steps: give `max_episode_steps` of `make`, too.
+        frame_skip: frames that a step repeats its action for, 1 to 1,000; only the last is drawn.
+            Gymnasium limits an episode by steps: give `max_episode_steps` of `make`, too.
         track: checkpoints of your own track, see `envs.own_track`; None for the track of a seed.
+
+    Raises:
+        ValueError: an option with a value that it does not take.
+        OSError: the file of `track` cannot be read.
 
     Attributes:
         cars: the engine's `Cars`, with this car as number 0.
@@ -147,7 +151,8 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
     ) -> tuple[np.ndarray, dict]:
         """Begin an episode on the track of `seed`; returns the observation and {}.
 
-        With `domain_randomize`, `options={"randomize": False}` keeps the colours.
+        Without a seed the random numbers go on. With `domain_randomize`,
+        `options={"randomize": False}` keeps the colours. RuntimeError after `close`.
         """
         self._check_open()
         super().reset(seed=seed)
@@ -158,7 +163,9 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         return self.view.look(self.cars)[0], {}
 
     def step(self, action: np.ndarray | int) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Drive `frame_skip` frames: (observation, reward, terminated, False, info).
+        """Drive `frame_skip` frames: (observation, their reward, terminated, False, info).
+
+        If it has terminated, `info["lap_finished"]` says whether the lap is complete.
 
         Raises:
             ValueError: an action that is not three finite numbers, or not one of the five.
@@ -190,7 +197,7 @@ class CarRacing(gym.Env, gym.utils.EzPickle):
         return self.view.look(self.cars)[0]
 
     def render(self) -> np.ndarray | None:
-        """Gymnasium's window: uint8 (400, 600, 3) for "rgb_array"; None for "human"."""
+        """Gymnasium's window: uint8 (400, 600, 3), "state_pixels" (96, 96, 3); None for "human"."""
         self._check_begun("render")
         if self.render_mode is None:
             gym.logger.warn("render() without a render_mode: give one to make(...)")

@@ -39,7 +39,7 @@ class Cars:
     that has ended is not restarted.
 
     Args:
-        count: number of cars.
+        count: number of cars, 1 to 100,000.
         shows: what `draw` draws: "observation", uint8 (96, 96, 3), or "frame", the agent's, uint8
             (64, 64, 3). Memory for the pictures, 5 MB a car, is taken at the first `draw`.
         bar: whether to draw the indicator bar. Without it the lowest rows of an observation are
@@ -51,7 +51,8 @@ class Cars:
         track: checkpoints of a track for all episodes, see `own_track`; None for that of a seed.
 
     Raises:
-        ValueError: as `check_rules` and `make_own_track`.
+        ValueError: another `count` or `shows`, or as `check_rules` and `make_own_track`.
+        OSError: as `make_own_track`.
 
     Attributes:
         cars: `physics.CAR` (count,), the state of each car; see there.
@@ -106,9 +107,13 @@ class Cars:
         """Begin new episodes.
 
         Args:
-            seeds: for each of these cars, its seed, or None to go on with its random numbers.
+            seeds: for each of these cars a whole number from 0 on, or None to go on with its
+                random numbers.
             which: numbers of the cars; all by default.
             randomize: whether to draw new colours, with `domain_randomize`.
+
+        Raises:
+            ValueError: other seeds, another number of them, or a car that is not there.
         """
         chosen = self._numbers(which).tolist()
         for car, seed in zip(chosen, check_seeds(seeds, len(chosen)), strict=True):
@@ -146,7 +151,7 @@ class Cars:
         return rewards, self.cars["ending"][which] != physics.DRIVING
 
     def draw(self, which: np.ndarray | None = None) -> np.ndarray:
-        """What cars see, uint8 (n, 96, 96, 3) or (n, 64, 64, 3); `which` as for `step`."""
+        """What cars see, uint8 (n, 96, 96, 3) or (n, 64, 64, 3); `which`, errors as for `step`."""
         which = self._started(which)
         if self.ground is None:
             self.ground = picture.make_ground(len(self))
@@ -163,7 +168,7 @@ class Cars:
     ) -> None:
         """Put a car on a tile of its track, moving, with the opening zoom behind it.
 
-        A random driver sees more than the first bend only so: CarRacing starts at rest on tile 0.
+        From tile 0, where CarRacing starts, a random driver sees little more than the first bend.
 
         Args:
             tile: number of the tile, modulo their count.
@@ -172,7 +177,9 @@ class Cars:
             offset: from the centre line, in half road widths, positive to the right.
 
         Raises:
-            ValueError: a tile that is not a whole number, or another number that is not finite.
+            ValueError: a car that is not there, a tile that is not a whole number, or another
+                number that is not finite.
+            RuntimeError: as for `step`.
         """
         car = whole_number("car", car, 0, len(self) - 1)
         self._started([car])

@@ -116,7 +116,7 @@ def start_python(code: str) -> subprocess.Popen:
 
 @contextmanager
 def announced(beside: str | None = None) -> Iterator[Announcement]:
-    """Announce what is compiled within a `with` block."""
+    """Announce what is compiled within a `with` block; `beside` as of `Announcement`."""
     announcement = Announcement(beside)
     with event.install_listener("numba:compile", announcement):
         try:

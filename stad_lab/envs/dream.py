@@ -24,7 +24,7 @@ class DreamEnv(gym.Env):
     `info["hidden"]` is M's memory h, float32 (hidden_size,), which C sees beside z.
 
     Attributes:
-        temperature: of the sampling, above 0; may be changed between steps.
+        temperature: of the sampling, at least 1e-6; may be changed between steps.
 
     Args:
         vae, mdn_rnn: V and M, of one run.
@@ -59,9 +59,10 @@ class DreamEnv(gym.Env):
 
         Args:
             seed: of the dream's random source.
-            options: {"latents": the first z, float32 (latent_size,), "state": M's memory (h, c)};
-                without "latents" z is sampled from N(0, 1), without "state" the memory is empty.
-                ValueError for another shape or numbers that are not finite.
+            options: {"latents": the first z, float32 (latent_size,), "state": M's memory (h, c),
+                float32 (1, 1, hidden_size) each}; without "latents" z is sampled from N(0, 1),
+                without "state" the memory is empty. ValueError for another shape or numbers that
+                are not finite.
         """
         super().reset(seed=seed)
         options = check_options(options)
@@ -87,7 +88,12 @@ class DreamEnv(gym.Env):
 
     @torch.no_grad()
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Dream one frame: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h})."""
+        """Dream one frame: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h}).
+
+        Raises:
+            ValueError: an action that is not three finite numbers, or another temperature.
+            RuntimeError: called before `reset`.
+        """
         self._check_begun("step")
         action = finite_array("action", action, (ACTION_SIZE,), "steering, gas and brake")
         prediction, self.state = self.mdn_rnn(

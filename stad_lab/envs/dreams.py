@@ -34,7 +34,7 @@ class DreamVector(gym.vector.VectorEnv):
 
     Args:
         vae, mdn_rnn, temperature, max_frames, render_mode: as of `DreamEnv`.
-        num_envs: number of dreams.
+        num_envs: number of dreams, 1 to 100,000.
         autoreset_mode: "NextStep" or "Disabled", or Gymnasium's `AutoresetMode`.
     """
 
@@ -70,7 +70,8 @@ class DreamVector(gym.vector.VectorEnv):
 
         Args:
             seed: one for each dream, or n for n, n + 1, ...
-            options: "reset_mask", bool (num_envs,), to begin only some anew.
+            options: "reset_mask", bool (num_envs,), to begin only some anew. The first reset is of
+                all dreams; ValueError for another mask.
         """
         self._check_open()
         mask = np.asarray(check_options(options).get("reset_mask", np.ones(self.num_envs, bool)))
@@ -88,7 +89,13 @@ class DreamVector(gym.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Dream one frame; actions are float32 (num_envs, 3). Rewards are 0, as in `DreamEnv`."""
+        """Dream one frame; actions are float32 (num_envs, 3). Rewards are 0, as in `DreamEnv`.
+
+        Raises:
+            ValueError: actions of another shape, or not finite.
+            ResetNeeded: before the first reset.
+            RuntimeError: a dream that has ended must be reset first (DISABLED).
+        """
         self._check_open()
         if not self._begun:
             raise ResetNeeded("no dream has begun: call reset before step")

@@ -50,7 +50,7 @@ def make_own_track(checkpoints: Checkpoints) -> Track:
 
 
 def read_checkpoints(path: Path) -> list:
-    """The entry "checkpoints" of a JSON file. ValueError if it has none."""
+    """The entry "checkpoints" of a JSON file. ValueError if it has none; OSError without a file."""
     if not path.is_file():
         expected = "expected a JSON file of checkpoints"
         raise FileNotFoundError(f"track={str(path)!r} is no file: {expected}")
@@ -64,7 +64,10 @@ def read_checkpoints(path: Path) -> list:
 
 
 def find_own_path(points: np.ndarray) -> np.ndarray:
-    """The centre line through checkpoints (n, 2): float64 (tiles, 4), as `Track.path`."""
+    """The centre line through checkpoints (n, 2): float64 (tiles, 4), as `Track.path`.
+
+    ValueError if two neighbours are the same, or the lap is too short or too long.
+    """
     if (np.hypot(*(points - np.roll(points, 1, axis=0)).T) < 1e-3).any():
         raise ValueError(
             "two neighbouring checkpoints are the same: leave one out, also at the end"

@@ -44,13 +44,13 @@ def true_motion(cars: Cars, car: int = 0) -> np.ndarray:
 
 
 def nearest_tile(cars: Cars, car: int) -> int:
-    """The point of the centre line that is nearest to the car."""
+    """Index in `Track.path` of the point that is nearest to the car."""
     path, (x, y) = cars.tracks[car].path, cars.cars[car]["position"][0]
     return int(np.hypot(path[:, 2] - x, path[:, 3] - y).argmin())
 
 
 def curvature_ahead(cars: Cars, car: int) -> np.ndarray:
-    """Mean curvatures of the road between the distances of AHEAD: float64 (4,)."""
+    """Mean curvatures of the road between the distances of AHEAD: float64 (4,), see STATE."""
     heading = cars.tracks[car].path[:, 1]
     there = heading[(nearest_tile(cars, car) + np.arange(AHEAD[-1] + 1)) % len(heading)]
     turns = (np.diff(there) + np.pi) % (2 * np.pi) - np.pi  # from tile to tile

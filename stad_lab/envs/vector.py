@@ -37,7 +37,7 @@ class CarRacingVector(gym.vector.VectorEnv):
     """`num_envs` cars, each with its own track.
 
     Args:
-        num_envs: number of cars.
+        num_envs: number of cars, 1 to 100,000.
         max_episode_steps: steps after which an episode is truncated.
         autoreset_mode: one of Gymnasium's `AutoresetMode`, or its value such as "NextStep".
             NEXT_STEP, the default: the step after an episode's end begins a new one and ignores
@@ -47,6 +47,10 @@ class CarRacingVector(gym.vector.VectorEnv):
         render_mode: None; a batch has no window.
         continuous, lap_complete_percent, domain_randomize: as Gymnasium's.
         observes, size, frame_skip, track: as of `CarRacing`.
+
+    Raises:
+        ValueError: as `CarRacing`.
+        OSError: as `CarRacing`.
 
     Attributes:
         cars: the engine's `Cars`.
@@ -91,7 +95,7 @@ class CarRacingVector(gym.vector.VectorEnv):
         Args:
             seed: of the tracks: one for each car, or n for n, n + 1, ...
             options: "reset_mask", bool (num_envs,), to reset only some cars; and "randomize", as
-                for `CarRacing.reset`.
+                for `CarRacing.reset`. The first reset is of all cars; ValueError for another mask.
 
         Returns:
             Observations, of `observation_space`, and {}.

@@ -39,7 +39,7 @@ class View:
             self.space = gym.spaces.Box(-np.inf, np.inf, (len(STATE),), np.float32)
 
     def look(self, cars: Cars, which: np.ndarray | None = None) -> np.ndarray:
-        """The observations of some cars, or of all."""
+        """The observations of some cars, or of all, one to a row; see `space`."""
         if self.observes == "picture" and self.size == OBSERVATION_SIZE:
             return cars.draw(which)
         which = np.arange(len(cars)) if which is None else which
@@ -64,7 +64,7 @@ class View:
 
 
 def draw_above(cars: Cars, car: int, size: int) -> np.ndarray:
-    """The whole track of a car, which is red, from above: uint8 (size, size, 3), north is up."""
+    """A car, in red, and its whole track from above: uint8 (size, size, 3), north is up."""
     polygons, whole = road_of(cars, car), FINER * size
     corners = np.concatenate([corners for corners, _ in polygons])
     low, high = corners.min(axis=0), corners.max(axis=0)

@@ -18,7 +18,7 @@ class Window:
         self.env.car = None
 
     def draw(self, cars: Cars, car: int = 0) -> np.ndarray | None:
-        """Copy the state of a car and draw it with Gymnasium's code."""
+        """Draw the state of a car with Gymnasium's code, and return what its `render` returns."""
         env, state = self.env, cars.cars[car]
         env.t, env.reward = float(state["time"]), float(state["reward"])
         env.road_color, env.bg_color, env.grass_color = (

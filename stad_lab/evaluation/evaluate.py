@@ -60,7 +60,9 @@ def evaluate(
         "episodes": "track", "return" and "frames".
 
     Raises:
-        ValueError: tracks outside the range for tests; and what `load_agent` raises.
+        ValueError: tracks outside the range for tests, a damaged file `unfinished`, or as
+            `worker_processes`.
+        FileNotFoundError, ValueError: as `load_agent`.
         TaskError: an episode failed.
     """
     check_tracks(episodes, first_track)
@@ -141,7 +143,7 @@ def report(tracks: list[int], returns: np.ndarray, lengths: np.ndarray) -> dict:
 
 
 def check_output(path: Path) -> None:
-    """Raise ValueError if a result would overwrite anything but a result, OSError if it cannot."""
+    """Raise ValueError if a result would overwrite anything but a result, OSError if unwritable."""
     check_writable(path)
     if path.name in RUN_FILES:
         raise ValueError(f"{path} is the name of a run's own file: choose another name")
@@ -155,7 +157,7 @@ def check_output(path: Path) -> None:
 
 
 def load_evaluation(path: Path) -> dict:
-    """Read an evaluation. ValueError unless its summary is that of its episodes."""
+    """Read an evaluation. Raises as `load_json`; ValueError if summary and episodes disagree."""
     found = load_json(path, "evaluate again", kind=KIND)
     episodes = found.get("episodes", [])
     tracks = {episode["track"] for episode in episodes}
@@ -169,7 +171,7 @@ def load_evaluation(path: Path) -> dict:
 
 
 def evaluations_of(folder: Path) -> dict[Path, dict]:
-    """The evaluations in a folder by their files, of this C or of an earlier one."""
+    """The evaluations in a folder by their files `evaluation*.json`, also of an earlier C."""
     return {file: load_evaluation(file) for file in sorted(folder.glob("evaluation*.json"))}
 
 

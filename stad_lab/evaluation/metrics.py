@@ -53,7 +53,10 @@ class Reconstruction(NamedTuple):
 
 @torch.no_grad()
 def reconstruct(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> Reconstruction:
-    """Encode and decode frames, uint8 (n, 64, 64, 3), through the mean of z."""
+    """Encode and decode frames through the mean of z.
+
+    `frames`, and `earlier`, which are subtracted from them, are uint8 (n, 64, 64, 3).
+    """
     parts = []
     for pictures in chunks(frames, earlier):
         mu, logvar = vae.encode(*pictures)
@@ -66,7 +69,7 @@ def reconstruct(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> Reconstruc
 
 
 def vae_metrics(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> dict:
-    """Measure V on unseen frames, uint8 (n, 64, 64, 3), without the indicator bar.
+    """Measure V on unseen frames without the indicator bar; arguments as of `reconstruct`.
 
     Returns:
         A dict for JSON. "frame_error" and "difference_error" (None if not reconstructed) are
@@ -188,11 +191,13 @@ def dream_open_loop(
     """Let M dream on with the actions that were really taken, `dreams` times in every episode.
 
     Args:
-        latents: z of episodes, float32 (episodes, T, latent_size); M sees the first `awake`.
+        latents: z of episodes, float32 (episodes, T, latent_size).
         actions: float32 (episodes, T, 3).
+        awake: number of frames that M sees first, 1 to T - 1.
+        temperature: as for `Mixture.sample`, with its ValueError.
 
     Returns:
-        z of frames awake, awake + 1, ..., T - 1: float32 (dreams, episodes, T - awake, z).
+        z of frames awake to T - 1: float32 (dreams, episodes, T - awake, latent_size).
     """
     generator = torch.Generator().manual_seed(0)
     z, a = (torch.from_numpy(np.tile(part, (dreams, 1, 1))) for part in (latents, actions))
@@ -218,7 +223,8 @@ def horizon_errors(
         steps: at which to compare, 1 for the first dreamed frame.
 
     Returns:
-        Root mean squared errors at these steps, as a share of that of the mean frame of the step.
+        Root mean squared errors at these steps, as a share of that of the mean frame of the step:
+        of "one dream", the "mean of the dreams" and "the last frame seen".
     """
     last = decode(vae, mu[:, awake - 1])
     errors: dict[str, list] = {"one dream": [], "mean of the dreams": [], "the last frame seen": []}

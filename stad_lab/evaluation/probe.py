@@ -28,14 +28,18 @@ def probe(
 
     Args:
         features: (n, features), for example z of every frame.
-        targets: (n, targets), for example the motion of the car; none may be constant.
+        targets: (n, targets), for example the motion of the car.
         episodes: (n,), the episode of each row. Rows of one episode are alike, so episodes are
-            never split; at least 10.
+            never split.
         seed: of the split and of the bootstrap.
         resamples: of the bootstrap over held-out episodes.
 
     Returns:
         "r2" (targets,), "low" and "high" (targets,): its 95% interval.
+
+    Raises:
+        ValueError: unequal numbers of rows, numbers that are not finite, a constant target, or
+            fewer than 10 episodes.
     """
     check_rows(features, targets, episodes)
     rng = np.random.default_rng(seed)

@@ -59,9 +59,7 @@ Driven = tuple[list[Trajectory], int]
 
 
 def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, Driven]:
-    """The random driver's trajectories, and of AGENT, who is fast on the road, a third as many.
-
-    At least FEWEST_TRAJECTORIES.
+    """The random driver's trajectories `driven`, and those of AGENT from `agent_trajectories`.
 
     Returns driver -> (trajectories, number of first frames of each that are not probed).
     """
@@ -70,7 +68,7 @@ def two_drivers(driven: list[Trajectory], processes: int) -> dict[str, Driven]:
 
 
 def agent_trajectories(count: int, processes: int) -> Driven:
-    """Trajectories of AGENT, on tracks kept for inspection: a third of `count`."""
+    """Trajectories of AGENT on tracks for inspection: `count` / 3, at least FEWEST_TRAJECTORIES."""
     tracks = track_seeds("inspect", max(FEWEST_TRAJECTORIES, count // 3), 2)
     tasks = [(load_agent(AGENT), track, AGENT_FRAMES) for track in tracks]
     with worker_threads(processes) as executor:
@@ -80,9 +78,9 @@ def agent_trajectories(count: int, processes: int) -> Driven:
 def frames_in_sight(
     driven: list[Trajectory], skip: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Which frames the probe counts, bool (frames,), with the motion and trajectory of each.
+    """Which of n frames the probe counts, bool (n,); the motion (n, 6) and trajectory (n,) of all.
 
-    They show the road, after the first `skip` of each trajectory.
+    It counts those that show the road, after the first `skip` of each trajectory.
     """
     motion = np.concatenate([one.motion for one in driven])
     number = np.repeat(np.arange(len(driven)), [len(one) for one in driven])

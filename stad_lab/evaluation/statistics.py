@@ -11,7 +11,10 @@ RESAMPLES = 10_000  # of a bootstrap
 
 
 def summarise(returns: np.ndarray) -> dict:
-    """Mean, deviation, interval of the mean and share above 900: (tracks,) or (seeds, tracks)."""
+    """Mean, deviation, interval of the mean and share above 900: (tracks,) or (seeds, tracks).
+
+    The keys are "mean", "standard_deviation", "interval" (as `bootstrap`) and "above_900".
+    """
     return {
         "mean": float(returns.mean()),
         "standard_deviation": float(returns.std(ddof=1)) if returns.size > 1 else 0.0,
@@ -21,7 +24,7 @@ def summarise(returns: np.ndarray) -> dict:
 
 
 def describe_tail(returns: np.ndarray) -> dict:
-    """Minimum, tenth percentile, share and number of the episodes below 800."""
+    """Minimum, tenth percentile, share ("below_800") and number ("failed") of those below 800."""
     return {
         "minimum": float(returns.min()),
         "tenth_percentile": float(np.percentile(returns, 10)),
@@ -67,7 +70,7 @@ def equivalence_p(differences: Sequence[float] | np.ndarray, margin: float) -> f
 
 
 def mean_interval(values: Sequence[float] | np.ndarray, outside: float = 0.05) -> list[float]:
-    """Student's interval of the mean of two values or more; half of `outside` on each side."""
+    """Student's interval of the mean of two values or more, of level 1 - `outside`: [low, high]."""
     error = scipy.stats.sem(values)
     ends = scipy.stats.t.ppf([outside / 2, 1 - outside / 2], len(values) - 1)
     return [float(np.mean(values) + t * error) for t in ends]

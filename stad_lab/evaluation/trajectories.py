@@ -58,7 +58,7 @@ class Recorder:
 
 
 def road_in_sight(motion: np.ndarray) -> np.ndarray:
-    """Whether the car is within 3 half road widths of the centre and heads along: bool (T,).
+    """Whether the car is within 3 half road widths of the centre and heads forward: bool (T,).
 
     Elsewhere the picture shows only grass, and no latent could encode where the road is.
     """
@@ -67,7 +67,7 @@ def road_in_sight(motion: np.ndarray) -> np.ndarray:
 
 
 def record(driver: Driver, cars: Cars, frames: int) -> Trajectory:
-    """Drive one car on, for at most this number of frames."""
+    """Drive one car, which shows observations, for at most this number of frames."""
     recorder = Recorder(cars)
     episodes = rollout(driver, cars, max_frames=frames, observe=recorder)
     return recorder.trajectory(episodes.rewards[0])

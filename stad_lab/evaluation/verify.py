@@ -50,10 +50,13 @@ class NotRepeated(ValueError):
 def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, str]:
     """Check every file of the run in `folder`, and drive three recorded episodes again.
 
+    Args:
+        executor: where episodes run; None for workers of this machine.
+
     Returns:
         What was checked -> what was found. It begins with "ok", "FAILED", "none" if there is
-        nothing to check, or "differs" if a result differs within bounds, and this machine does from
-        the recorded one, or may differ because it was not recorded as a whole.
+        nothing to check, or "differs" if a result differs within bounds and this machine differs
+        from the recorded one, or parts of that one are not recorded.
 
     Raises:
         FileNotFoundError, ValueError: no record in the folder, or a damaged one.
@@ -120,7 +123,7 @@ def verify_dataset(folder: Path) -> str:
 
 
 def logged(folder: Path, config: Config) -> tuple[Config, dict]:
-    """The log of CMA-ES, and the configuration with its generations: a run may be longer now."""
+    """The configuration, with the number of generations of the log of CMA-ES, and that log."""
     asked = load_json(folder / evolution.LOG, kind="evolution")["evolution"]["generations"]
     config = config.replace(evolution={"generations": asked})
     return config, evolution.read_log(config, folder, load_world_model(folder))

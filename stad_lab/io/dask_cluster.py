@@ -32,6 +32,7 @@ class ClusterExecutor(ClientExecutor):
 
         It is the result of a task, so Dask computes it again if the workers that held it are lost.
         All workers fetch it now, because Dask prefers to send a task to where its arguments are.
+        Raises as `run_tasks`.
         """
         once = {"allow_other_workers": True, "pure": False}
         with warnings.catch_warnings(), task_errors("share"):

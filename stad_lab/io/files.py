@@ -91,7 +91,7 @@ def write_bytes(path: Path, content: bytes | memoryview) -> None:
 
 
 def replace(temporary: Path, path: Path) -> None:
-    """Rename a file to the name of another one; PermissionError if PATIENCE does not help."""
+    """Rename a file over another one; PermissionError if that is still refused after PATIENCE."""
     deadline = time.monotonic() + PATIENCE
     while True:
         try:
@@ -182,6 +182,10 @@ def checksum_of_json(value: Any) -> str:
 
 def load_json(path: Path, remedy: str = "make it again", kind: str | None = None) -> dict:
     """Read what `save_json` wrote.
+
+    Args:
+        remedy: what the message of an error advises.
+        kind: that the file must be of; None for any.
 
     Raises:
         OSError: as `read_bytes`.

@@ -82,7 +82,10 @@ def load_mdn_rnn(path: Path) -> tuple[MDNRNN, dict]:
 
 
 def save_controller(path: Path, parameters: np.ndarray, **metadata) -> None:
-    """Write C's parameters, float64 (parameters,), with where they come from."""
+    """Write C's parameters, float64 (parameters,), with where they come from.
+
+    `load_controller` needs "variant", and the checksums "vae" and "mdn_rnn", in the metadata.
+    """
     tensors = {"parameters": torch.from_numpy(parameters)}
     save_tensors(path, tensors, kind="controller", **metadata)
 
@@ -98,7 +101,7 @@ def load_controller(path: Path) -> tuple[np.ndarray, dict]:
 
 
 def load_kind(path: Path, kind: str, *required: str) -> tuple[dict[str, torch.Tensor], dict]:
-    """Read a file that must be of this kind and have these entries of metadata."""
+    """Read a file of this kind, with these entries of metadata. Raises as `load_vae`."""
     tensors, metadata = load_tensors(path, REMEDY)
     if "part" in metadata:
         raise ValueError(f"{path} was written by stad_lab 0.1: use that version, or train again")

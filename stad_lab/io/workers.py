@@ -62,7 +62,8 @@ def check_count(count: int) -> int:
 def worker_threads(count: int, given: Executor | None = None) -> Iterator[Executor]:
     """A pool of `count` threads for a `with` block; or the given executor, which stays open.
 
-    If the block is left by an interrupt or an error, rollouts stop within a frame.
+    If the block is left by an interrupt or an error, rollouts stop within a frame. ValueError if
+    `count` is below 1.
     """
     if given is not None:
         yield given
@@ -99,10 +100,11 @@ def run_here(home: str, function: Callable, *arguments, **named) -> object:
 
 @contextmanager
 def worker_processes(count: int, given: Executor | None = None) -> Iterator[Executor]:
-    """A pool of `count` fresh processes for a `with` block; or the given executor.
+    """A pool of `count` fresh processes for a `with` block; or the given executor, left open.
 
     The processes ignore Ctrl-C and end with their parent. If the block is left by an interrupt or
-    an error, they are killed. ValueError for a script that workers cannot import.
+    an error, they are killed. ValueError if `count` is below 1, or for a script without a line
+    `if __name__ == "__main__":`, which would run again in every process.
     """
     if given is not None:
         yield given
@@ -243,7 +245,7 @@ def run_in_order(
     label: str | None = None,
     unit: str = "episode",
 ) -> list:
-    """The results of all tasks in their order; with a progress bar of units if it has a label."""
+    """The results of all tasks in order, with a bar if it has a label. Raises as `run_tasks`."""
     finished = run_tasks(executor, function, tasks)
     results = dict(tqdm(finished, label, len(tasks), unit=unit, disable=label is None))
     return [results[number] for number in range(len(tasks))]

@@ -56,7 +56,7 @@ def control(parameters: np.ndarray, features: np.ndarray) -> np.ndarray:
 
 
 def squash(raw: np.ndarray) -> np.ndarray:
-    """Bound outputs (..., 3) as World Models does: tanh, (tanh + 1) / 2, and tanh above 0."""
+    """Bound outputs (..., 3) as World Models does: tanh, (tanh + 1) / 2 and max(tanh, 0)."""
     steering, gas, brake = np.moveaxis(np.tanh(raw), -1, 0)
     return np.stack([steering, (gas + 1) / 2, np.clip(brake, 0, 1)], axis=-1)
 

@@ -100,7 +100,7 @@ class MDNRNN(nn.Module):
     def remember(
         self, latents: torch.Tensor, actions: torch.Tensor, state: State | None = None
     ) -> tuple[torch.Tensor, State]:
-        """The memory alone: h after every step (batch, time, hidden_size), and the state."""
+        """The memory alone: h after every step (batch, time, hidden_size), and the last state."""
         return self.lstm(torch.cat([latents, actions], dim=2), state)
 
     def mixture(self, hidden: torch.Tensor) -> Mixture:
@@ -125,7 +125,7 @@ def to_state(memory: np.ndarray | None) -> State | None:
 
 
 def check_temperature(temperature: float) -> None:
-    """Raise ValueError unless float32 can divide by the temperature, and it is above 0."""
+    """Raise ValueError unless the temperature is a number, at least 1e-6 and less than 1e20."""
     number = isinstance(temperature, int | float | np.number) and temperature is not True
     if not number or not 1e-6 <= temperature < 1e20:
         found = " ".join(repr(temperature).split())

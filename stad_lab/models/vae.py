@@ -32,7 +32,7 @@ class VAE(nn.Module):
     """V: pictures -> latent z -> pictures.
 
     Args:
-        variant: one of DIFFERENCE.
+        variant: one of DIFFERENCE; ValueError for another.
         latent_size: dimensions of z.
         width: channels of the first convolution (World Models: 32; `Config` has 16).
     """
@@ -86,7 +86,10 @@ class VAE(nn.Module):
         return mu, soft_bound(logvar, *LOGVAR_RANGE)
 
     def decode(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """z (batch, latent_size) -> the frame, and the difference image or None."""
+        """z (batch, latent_size) -> the frame, and the difference image or None.
+
+        Shapes and ranges are those of `encode`; None if V does not reconstruct the difference.
+        """
         parts = self.decoder(z).split(3, dim=1)
         # Copies: sigmoid and tanh are several times slower on a part of an array.
         parts = [part.contiguous(memory_format=torch.channels_last) for part in parts]
@@ -96,7 +99,7 @@ class VAE(nn.Module):
     def reconstruct(
         self, frame: torch.Tensor, difference: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """Encode and decode through the mean mu, without sampling: shapes as of both."""
+        """Encode, then decode mu without sampling: arguments of `encode`, results of `decode`."""
         return self.decode(self.encode(frame, difference)[0])
 
 
@@ -167,10 +170,10 @@ def vae_losses(
     """The loss of V, "total", and its terms; means over the batch.
 
     "frame_error" and, if it is reconstructed, "difference_error" are squared errors, summed over a
-    picture; "kl" is in nats.
+    picture; "kl" is in nats, without `free_bits`.
 
     Args:
-        frame, difference: as for `VAE.encode`.
+        frame, difference: as for `VAE.encode`; a V that reconstructs the difference needs it, too.
         noise: N(0, 1), (batch, latent_size).
         kl_weight: weight of the KL term.
         free_bits: nats for each latent below which a picture's KL is not penalised (Kingma et al.

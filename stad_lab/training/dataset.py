@@ -72,8 +72,9 @@ def random_start(
 ) -> tuple[Cars, RandomDriver]:
     """A car where episode `index` of the random driver begins, and the driver.
 
-    Most episodes start moving on a random tile; otherwise the data would hold little but the first
-    bend and grass. `use` is a key of TRACK_RANGES, `shows` what the car sees, as for `Cars`.
+    A share `data.random_starts` of the episodes begins moving on a random tile; otherwise the data
+    would hold little but the first bend and grass. `index` is below `data.episodes`, `use` a key of
+    TRACK_RANGES, `shows` what the car sees, as for `Cars`.
     """
     rng = random_stream("random driver", config.seed, index)
     cars = Cars(1, shows, bar=shows == "observation" or not config.data.crop_bar)
@@ -92,7 +93,7 @@ def drive_randomly(config: Config, index: int) -> Episode:
 
 
 def record_frames(driver: Driver, cars: Cars, **limits) -> tuple[np.ndarray, np.ndarray]:
-    """Drive one episode; returns its frames and the action taken on each."""
+    """Drive one episode; returns frames and actions as in `Episode`. `limits` are of `rollout`."""
     frames, actions = [], []
 
     def observe(_: np.ndarray, seen: np.ndarray, action: np.ndarray) -> None:
@@ -110,7 +111,7 @@ def collect(config: Config, folder: Path, executor: Executor | None = None) -> b
         executor: where episodes run; None for `config.processes` threads of this machine.
 
     Raises:
-        ValueError: the folder holds a dataset of another configuration.
+        ValueError: the folder holds a dataset of another configuration, or a damaged manifest.
         OSError: the disk has not enough space, or another process works in the folder.
         TaskError: an episode failed.
     """
@@ -191,7 +192,7 @@ def read_manifest(folder: Path, made_with: dict) -> dict:
 
 
 def load_manifest(path: Path, remedy: str = "collect again") -> dict:
-    """Read a manifest. ValueError if it is damaged, or of another kind."""
+    """Read a manifest. Arguments and errors are those of `load_json`."""
     return load_json(path, remedy, kind="dataset")
 
 
@@ -217,7 +218,7 @@ class EpisodeFrames(Sequence):
         return np.load(self.paths[index], allow_pickle=False)
 
     def read(self, index: int, moments: list[int], into: list[np.ndarray]) -> None:
-        """Read single frames of an episode into arrays uint8 (64, 64, 3)."""
+        """Read single frames into arrays uint8 (64, 64, 3). ValueError if the file is too short."""
         with self.paths[index].open("rb", buffering=0) as file:
             for moment, frame in zip(moments, into, strict=True):
                 file.seek(NPY_HEADER + moment * frame.nbytes)
@@ -231,6 +232,7 @@ class Dataset:
     Attributes:
         frames: uint8 (T, 64, 64, 3) for each episode, read at every access.
         actions: float32 (T, 3) for each episode.
+        episode, moment: int64 (frames,), the episode of every frame, and its number there.
         checksum: of the whole dataset; V keeps that of the one it was trained on.
 
     Raises:
@@ -271,7 +273,7 @@ class Dataset:
         return len(self.episode)
 
     def pairs(self, indices: np.ndarray, stride: int) -> tuple[np.ndarray, np.ndarray]:
-        """Some frames and those to subtract from them, uint8 (n, 64, 64, 3) each."""
+        """Frames by their indices (n,) and those to subtract: uint8 (n, 64, 64, 3) each."""
         episodes, moments = self.episode[indices], self.moment[indices]
         before = earlier_index(moments, stride)
         frames, earlier = np.empty((2, len(indices), FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
@@ -282,7 +284,7 @@ class Dataset:
 
     @property
     def first_heldout(self) -> int:
-        """The first of the episodes, up to the last, that are held out from training."""
+        """Index of the first held-out episode; it and all later ones are kept from training."""
         return len(self.frames) - max(1, round(len(self.frames) / HELDOUT))
 
     def split(self) -> tuple[np.ndarray, np.ndarray]:
@@ -298,7 +300,7 @@ def count_episodes(manifest: dict) -> tuple[int, int]:
 
 
 def dataset_checksum(manifest: dict) -> str:
-    """The checksum of a whole dataset."""
+    """SHA-256 of a manifest's entries, which hold the checksums of all files."""
     return checksum(json.dumps(manifest["episodes"]).encode())
 
 

@@ -36,13 +36,13 @@ REMEMBERED, RESTING = 20, 4
 
 
 class DrivingModel(Protocol):
-    """What drives in place of a world model, for example with another view of z."""
+    """What `evolve` drives with in place of a world model, if C is to see something else."""
 
     sizes: tuple[int, int]  # how many numbers z has, and how many C sees beside it
     checksums: dict[str, str]  # what a log and a controller must belong to
 
     def drive(self, parameters: np.ndarray, tracks: list[int], **limits) -> Episodes:
-        """As `stad_lab.agent.drive`."""
+        """Drive each track once, with its row of `parameters`, as `stad_lab.agent.drive`."""
 
 
 @dataclasses.dataclass
@@ -74,7 +74,7 @@ def evolve(
 
     Args:
         executor: where episodes run; None for `config.processes` threads of this machine.
-        watch: called with the log's generations after each, and when a run is resumed.
+        watch: called with the log's generations after each, and first with those already there.
         drives: what drives instead of the V and M in `folder`; on this machine alone.
 
     Raises:
@@ -159,6 +159,7 @@ def resume(config: Config, folder: Path, world_model: WorldModel, log: dict) -> 
     Raises:
         ValueError: the log was changed, comes from another machine, or its last validated C does
             not follow from the search space in `folder`.
+        FileNotFoundError, ValueError: as `search_space`.
     """
     space, generations = search_space(config, world_model, folder), log["generations"]
     strategy, means = replay(space.first, config.evolution, log)
@@ -175,7 +176,7 @@ def resume(config: Config, folder: Path, world_model: WorldModel, log: dict) -> 
 
 
 def make_strategy(start: np.ndarray, settings: EvolutionConfig, random: dict) -> "Strategy":
-    """pycma's strategy from `start`, float64 (dimensions,), with `random` as the seed.
+    """pycma's strategy from `start`, float64 (dimensions,); its SeedSequence takes `random`.
 
     The rule that adapts the step size is set explicitly: pycma's default has changed between its
     versions, and depends on the number of dimensions. CSA compares the length of the mean's path
@@ -198,7 +199,7 @@ def make_strategy(start: np.ndarray, settings: EvolutionConfig, random: dict) ->
 
 
 def ask(strategy: "Strategy", settings: EvolutionConfig, generation: int) -> np.ndarray:
-    """The population of a generation, float64 (agents, dimensions).
+    """The population of a generation, counted from 0: float64 (agents, dimensions).
 
     With `sigma_decay` the step size follows a schedule: in hundreds of dimensions CMA-ES takes
     dozens of generations to adapt it.
@@ -209,7 +210,7 @@ def ask(strategy: "Strategy", settings: EvolutionConfig, generation: int) -> np.
 
 
 def tell(strategy: "Strategy", population: np.ndarray, returns: list, means: list) -> None:
-    """Tell CMA-ES, which minimises, the candidates' returns; appends to the means."""
+    """Tell CMA-ES, which minimises, the returns (agents, tracks); adds its mean to `means`."""
     strategy.tell(population, [-np.mean(own) for own in returns])
     means.append(strategy.mean.copy())
 
@@ -273,7 +274,7 @@ def keep_controller(run: Evolution, controller: np.ndarray) -> None:
 
 
 def crc(vector: np.ndarray) -> int:
-    """CRC-32 of the bytes of a float64 vector: vectors that agree in it are bit-identical."""
+    """CRC-32 of the bytes of a float64 vector: vectors that differ in it are not bit-identical."""
     return zlib.crc32(np.ascontiguousarray(vector).tobytes())
 
 
@@ -281,9 +282,9 @@ def generation_tracks(config: Config, earlier: list[dict]) -> list[int]:
     """The tracks of the generation after the `earlier` ones: new ones, and some hard ones again.
 
     On an easy track the fastest agents win, even if they lose hundreds of points elsewhere. So a
-    share `replay_share` of the tracks is replayed: those on which the mean agent did worst when it
-    last drove them, among the last REMEMBERED generations without the last RESTING ones. It is a
-    simple form of prioritized level replay (Jiang, Grefenstette and Rocktaschel, 2021).
+    share `replay_share` of the tracks is replayed: those on which the mean return of the agents was
+    lowest when last driven, among the last REMEMBERED generations without the last RESTING ones. It
+    is a simple form of prioritized level replay (Jiang, Grefenstette and Rocktaschel, 2021).
     """
     settings, number = config.evolution, len(earlier)
     new = track_seeds("evolve", settings.tracks, config.seed, number, settings.seed)
@@ -319,7 +320,7 @@ def drive_generation(
 
 
 def validate(executor: Executor, source: Any, config: Config, controller: np.ndarray) -> dict:
-    """Drive a controller, float64 (parameters,), on the validation tracks."""
+    """Drive C, float64 (parameters,), on the validation tracks; returns its entry of the log."""
     tracks = track_seeds("validate", config.evolution.validation_tracks)  # for every seed the same
     copies = np.repeat(controller[None], len(tracks), axis=0)
     settings = dataclasses.replace(config.evolution, patience=0)  # as in the evaluation
@@ -356,7 +357,7 @@ def drive_group(
     fast: bool = True,
     limits: dict | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Drive a group of cars: (returns, lengths). Runs in a worker."""
+    """Drive a group of cars: returns and lengths in frames, (cars,) each. Runs in a worker."""
     single_thread()
     if not isinstance(source, Path | WorldModel):
         return source.drive(parameters, tracks, **limits or {})[:2]
@@ -365,7 +366,7 @@ def drive_group(
 
 
 def hand_out(executor: Executor, source: Path | WorldModel) -> Any:
-    """What tells a worker which V and M to drive with: on this machine, they or their folder.
+    """V and M in the form that tasks are given: on this machine, `source` itself.
 
     A cluster may share no disk: its executor's `share` brings V and M once to every worker.
     """
@@ -376,7 +377,7 @@ def hand_out(executor: Executor, source: Path | WorldModel) -> Any:
 
 
 def make_agent(source: Path | WorldModel, parameters: np.ndarray) -> Agent:
-    """An agent of the V and M that `hand_out` names, and of C."""
+    """An agent of the V and M from `hand_out` and of C; without M's memory if no C sees h."""
     world_model = source if isinstance(source, WorldModel) else load_world_model(source)
     sees_hidden = unpack(parameters)[0][..., world_model.vae.latent_size :].any()
     return Agent(world_model, parameters, remembers=bool(sees_hidden))

@@ -42,7 +42,7 @@ TAKEN = (VAE_FILE, MDN_RNN_FILE, COMPONENTS_FILE)  # from the earlier run
 def fine_tuning_config(earlier: str | Path, **changes) -> Config:
     """The configuration of a fine-tuning of the run in `earlier`, with further changes.
 
-    ValueError for an unknown field or a value out of range; FileNotFoundError without a run.
+    ValueError for a wrong field or value, or an unfinished run; FileNotFoundError without a run.
     """
     record = read_finished(Path(earlier))
     return Config.from_dict(record["config"]).replace(**FINE_TUNING).replace(**changes)

@@ -41,7 +41,8 @@ def train_mdn_rnn(
 ) -> bool:
     """Train M on the dataset as V, in `folder`, encodes it; False if M was there already.
 
-    An interrupted training continues. Arguments and errors are those of `train_vae`.
+    An interrupted training continues. Arguments and errors are those of `train_vae`; ValueError,
+    too, if no training or no held-out episode is longer than `mdn_rnn.sequence`.
     """
     path = Path(folder) / MDN_RNN_FILE
     if path.exists():
@@ -85,7 +86,7 @@ def fit_mdn_rnn(
     device: torch.device,
     watch: Watch | None = None,
 ) -> None:
-    """Train an M on encoded episodes and write it to `path`."""
+    """Train an M on encoded episodes and write it to `path`. Raises as `fit`."""
     mdn_rnn = MDNRNN.of(config).to(device)
     training = mdn_rnn_training(config, latents, mdn_rnn, path.with_name(CHECKPOINT))
     training.watch = watch
@@ -141,7 +142,8 @@ def sequence_batch(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Random sequences of random episodes: z (count, length + 1, z) and actions (count, length, 3).
 
-    z is sampled from N(mu, exp(logvar)) each time, so that M cannot memorise one sample.
+    z is sampled from N(mu, exp(logvar)) each time, so that M cannot memorise one sample. Episodes
+    are as in `Latents`; ValueError if none has more than `length` frames.
     """
     long_enough = long_episodes([episode.shape[1] for episode in encoded], length)
     latents, chosen = [], []

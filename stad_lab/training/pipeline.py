@@ -142,7 +142,7 @@ def check_apart(earlier: Path, folder: Path) -> None:
 def check_stages(config: Config, folder: Path, data: Path) -> None:
     """Raise ValueError, before any work, if a finished stage in the folder is of another run.
 
-    Or if V and M of this configuration could be trained, but not drive.
+    Or if `Inference`, with which agents drive, refuses V or M of this configuration.
     """
     check_record(folder)
     with torch.random.fork_rng([]):
@@ -167,7 +167,10 @@ def run_stages(
     executor: Executor | None,
     before: dict | None,
 ) -> bool:
-    """Run some stages in order and keep the record of the run; False if nothing was to do."""
+    """Run some stages in order and keep the record of the run; False if nothing was to do.
+
+    `data` is the dataset's folder, None in a fine-tuning; `before` is the earlier run's record.
+    """
     worked = False
     with locked(folder):
         made = provenance(command_of(config) if data else fine_tuning_command(config))

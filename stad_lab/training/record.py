@@ -35,7 +35,7 @@ HEARTBEAT = 30.0  # seconds, after which the record says how long a stage has ta
 
 
 def check_record(folder: Path) -> None:
-    """Raise ValueError if a folder is a file, or holds a record of no run."""
+    """Raise ValueError if a folder is a file, or its record is damaged or of no run."""
     if folder.is_file():
         raise ValueError(f"{folder} is a file: {GIVE_A_RUN}")
     path = folder / RECORD
@@ -67,7 +67,8 @@ def read_finished(earlier: Path) -> dict:
 def open_record(config: Config, folder: Path, before: dict | None, made: dict) -> dict:
     """The record of the run in `folder`, or a new one that was made with `made`.
 
-    "earlier" is the record of the run that this one continues.
+    "earlier" is `before`, the record of the run that this one continues. ValueError if the record
+    there is damaged, or V exists and its variant, seed or settings differ.
     """
     path = folder / RECORD
     new: dict[str, Any] = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
@@ -90,9 +91,8 @@ def starts(record: dict) -> list[dict]:
 def timed(record: dict, made: dict, stage: str, folder: Path) -> Iterator[Callable[[], None]]:
     """Yields a function that adds the time of a `with` block to the record, and writes it.
 
-    It also adds `made` to "continued_with", if a start on another machine or with other versions
-    did the work before. A thread calls it during a long stage, so that a killed process has left
-    its time.
+    It also adds `made` to "continued_with", if the last start was made with anything else. A thread
+    calls it during a long stage, so that a killed process has left its time.
     """
     before, begin, ended = record["seconds"].get(stage, 0.0), time.perf_counter(), threading.Event()
     alone = threading.Lock()
@@ -196,7 +196,8 @@ def git(*arguments: str) -> str | None:
 def budget(config: Config, folder: Path, data: Path | None) -> dict:
     """All agents, episodes and frames that were driven for this run, by their purpose.
 
-    Those of an earlier run are in its own record; `total_budget` adds them.
+    "random", "agent_driver", "evolution" and "validation" have "episodes" and "frames"; "agents" is
+    a number. Those of an earlier run are in its own record; `total_budget` adds them.
     """
     spent: dict = defaultdict(Counter, random=Counter(episodes=0, frames=0))
     count = config.data.episodes

@@ -93,7 +93,7 @@ def drive_either(
 class NoisyDriver:
     """An agent whose steering and gas are disturbed, so that it meets many situations.
 
-    Every episode has another strength of noise. M receives the disturbed actions.
+    The strength of the noise is drawn once for a driver. M receives the disturbed actions.
     """
 
     def __init__(self, agent: Agent, rng: np.random.Generator):

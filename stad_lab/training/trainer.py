@@ -31,7 +31,7 @@ LARGEST_NORM = 100.0  # of the gradient, which is shortened to it
 LAST_RATE = 0.1  # learning rate at the end, as a share of that at the start
 
 Watch = Callable[[list[dict]], None]
-"""Called with a history after every entry, and when a training is resumed."""
+"""Called with a history after every entry, and first with what was there before."""
 
 
 @dataclass
@@ -136,7 +136,7 @@ def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[in
 
 @contextlib.contextmanager
 def torch_settings(seed: int, number: int) -> Iterator[torch.device]:
-    """Seed torch for a `with` block that makes and trains model `number`; yields its device.
+    """Seed torch for a `with` block that trains model `number` (V: 0, M: 1); yields its device.
 
     On a GPU, too, sums are float32 and repeat bit by bit. The caller's random state, default dtype
     and gradient mode are the same afterwards.

@@ -66,7 +66,7 @@ def vae_depends_on(config: Config) -> dict:
 
 
 def check_vae(config: Config, dataset: str | None, folder: Path) -> dict:
-    """V's metadata. ValueError if it is damaged, or of another configuration or dataset."""
+    """V's metadata. ValueError if damaged, or of another configuration or dataset (None: any)."""
     path = Path(folder) / VAE_FILE
     metadata = load_vae(path)[1]
     check_same(path, metadata, vae_depends_on(config))

@@ -119,7 +119,7 @@ def about(record: dict) -> str:
 
 
 def table(rows: dict) -> str:
-    """Two columns."""
+    """A table of names and values, as HTML."""
     cells = "".join(
         f"<tr><th scope=row>{html.escape(str(name))}</th><td>{html.escape(str(value))}</td></tr>"
         for name, value in rows.items()

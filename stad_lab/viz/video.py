@@ -64,8 +64,8 @@ def enlarged(picture: np.ndarray, size: int) -> Image.Image:
 def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
     """An animated GIF of observation, difference image, reconstruction and dream.
 
-    It covers `frames` frames from `first` on. Raises ValueError if the episode ends before `first`,
-    or for a number that is out of range.
+    It shows one in EVERY of `frames` frames from `first` on, fewer if the episode ends. Raises
+    ValueError if it ends before `first`, or for a number that is out of range.
     """
     trajectory, world_model = record_longer(agent, track, first, frames), agent.world_model
     seen, shown = trajectory.frames(world_model.crop_bar), slice(first, None, EVERY)

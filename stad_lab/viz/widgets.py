@@ -18,7 +18,7 @@ from stad_lab.viz.video import enlarged
 
 
 def show(*figures: Figure) -> HTML:
-    """Figures as pictures, one below the other, each with its alternative text (its label)."""
+    """Figures below each other, each with its label as alternative text; ValueError without one."""
     pictures = [show_picture(to_png(one), "png", str(one.get_label())) for one in figures]
     return HTML("".join(one.data for one in pictures))
 
