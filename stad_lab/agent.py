@@ -42,11 +42,8 @@ class Agent:
 
     Args:
         world_model: V and M.
-        parameters: of C, float (parameters,), or one row for each car (cars, parameters).
+        parameters: of C, finite, (parameters,), or a row for each car (cars, parameters).
         remembers: whether M updates its memory; a C that does not see h drives the same without.
-
-    Raises:
-        ValueError: parameters of another shape, or not finite; networks that `Inference` refuses.
     """
 
     def __init__(self, world_model: WorldModel, parameters: np.ndarray, remembers: bool = True):
@@ -77,12 +74,11 @@ class Agent:
 
         Args:
             seen: observations, uint8 (cars, 96, 96, 3), or frames, uint8 (cars, 64, 64, 3), with
-                the bar cropped as V was trained; frames are not checked. Their number changes only
-                by `keep` or `reset`; ValueError for another number.
+                the bar cropped as V was trained. Their number changes only by `keep` or `reset`.
         """
         seen = numbers("seen", seen, "an observation of each car")
         self._check_count(len(seen) if seen.ndim == 4 else 0)
-        if seen[0].shape[:2] != (FRAME_SIZE, FRAME_SIZE):
+        if seen.shape[1:] != (FRAME_SIZE, FRAME_SIZE, 3) or seen.dtype != np.uint8:
             seen = [to_frame(observation, self.world_model.crop_bar) for observation in seen]
         frames = np.asarray(seen)
         if self.state is None:
@@ -101,8 +97,7 @@ class Agent:
     def remember(self, actions: np.ndarray, before: np.ndarray | None) -> None:
         """Update M's memory with the last z and these actions, float32 (cars, 3).
 
-        `act` does it with its own actions. A driver that changes them calls this again. ValueError
-        before the first `act`.
+        `act` does it with its own actions. A driver that changes them calls this again.
 
         Args:
             before: `state` as it was before that `act`; None before an episode's first.
@@ -117,10 +112,7 @@ class Agent:
         return self.parameters[self.cars] if self.parameters.ndim == 2 else self.parameters
 
     def keep(self, cars: np.ndarray) -> None:
-        """Continue with some of the present cars, by their indices, until the next reset.
-
-        ValueError for an index that is not there or given twice, or before the first `act`.
-        """
+        """Continue with some of the present cars, by their indices, until the next reset."""
         self._check_acted()
         cars = car_numbers(cars, len(self.cars))
         self.memory.keep(cars)
@@ -204,9 +196,6 @@ def rollout(
         max_frames: of an episode, at most 1,000 as in CarRacing.
         patience: maximum number of frames without a new tile; 0 for no limit.
         observe: called before every step with the numbers of the cars, what they see, and actions.
-
-    Raises:
-        ValueError: `max_frames` below 1, `patience` below 0, or one that is not whole.
     """
     max_frames = whole_number("max_frames", max_frames, 1)
     patience = whole_number("patience", patience)
@@ -242,9 +231,6 @@ def drive(agent: Agent, tracks: Sequence[int], fast: bool = True, **limits) -> E
         tracks: seeds of the tracks, whole numbers from 0 on; one or more.
         fast: use our engine, which draws the agent's frames directly, not Gymnasium's environment.
         **limits: `max_frames`, `patience` and `observe` of `rollout`.
-
-    Raises:
-        ValueError: no tracks, another seed, or as `rollout` and `Agent.act_batch`.
     """
     if not isinstance(tracks, Sequence | np.ndarray) or not np.size(tracks):
         raise ValueError(f"tracks={shown(tracks)}: expected the seed of at least one track")
@@ -281,9 +267,6 @@ def load_agent(source: str | Path, controller: str | Path | None = None) -> Agen
         source: the name of a shipped agent, see `shipped_agents`; or the folder of a run, as a
             Path where it could be such a name.
         controller: a file of another C for this V and M, as the browser saves it; None: its own.
-
-    Returns:
-        The agent, as before its first observation.
 
     Raises:
         FileNotFoundError: no such agent or file, or the agent's run is not finished.

@@ -10,7 +10,7 @@ from stad_lab.io.weights import WorldModel
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE, to_tensor
 
-CHUNK = 250  # frames that V encodes at once
+CHUNK = 250  # frames that V encodes at once, or up to twice as many
 
 
 def chunks(frames: np.ndarray, earlier: np.ndarray) -> Iterator[list[torch.Tensor]]:

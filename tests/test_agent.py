@@ -240,6 +240,11 @@ def test_an_observation_of_another_shape_or_dtype_is_refused(observation, agent)
     assert str(observation.dtype) in str(error.value)
 
 
+def test_a_frame_whose_numbers_are_not_bytes_is_refused(agent):
+    with pytest.raises(ValueError, match=r"dtype int64 .*expected uint8"):
+        agent.act_batch(np.full((1, 64, 64, 3), 1000))
+
+
 def test_another_number_of_cars_is_refused(agent, observations):
     agent.act_batch(observations[:3])
     with pytest.raises(ValueError, match=r"2 observations, expected 3: .*call agent.reset"):

@@ -88,12 +88,7 @@ class DreamEnv(gym.Env):
 
     @torch.no_grad()
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Dream one frame: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h}).
-
-        Raises:
-            ValueError: an action that is not three finite numbers, or another temperature.
-            RuntimeError: called before `reset`.
-        """
+        """Dream one frame: (z, 0.0, False, whether `max_frames` is reached, {"hidden": h})."""
         self._check_begun("step")
         action = finite_array("action", action, (ACTION_SIZE,), "steering, gas and brake")
         prediction, self.state = self.mdn_rnn(

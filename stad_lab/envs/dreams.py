@@ -96,9 +96,7 @@ class DreamVector(gym.vector.VectorEnv):
             ResetNeeded: before the first reset.
             RuntimeError: a dream that has ended must be reset first (DISABLED).
         """
-        self._check_open()
-        if not self._begun:
-            raise ResetNeeded("no dream has begun: call reset before step")
+        self._check_begun()
         actions = numbers("actions", actions, "one action for each dream").astype(np.float32)
         if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
             raise ValueError(
@@ -122,7 +120,7 @@ class DreamVector(gym.vector.VectorEnv):
         """What V decodes from each z: uint8 (64, 64, 3); None without a render mode."""
         if self.render_mode is None:
             return None
-        self._check_open()
+        self._check_begun()
         return tuple(to_uint8(self.vae.decode(torch.from_numpy(self._observations()))[0]))
 
     def _predict(self, numbers: np.ndarray, actions: np.ndarray) -> None:
@@ -154,3 +152,8 @@ class DreamVector(gym.vector.VectorEnv):
     def _check_open(self) -> None:
         if self.closed:
             raise ClosedEnvironmentError("this environment is closed: make another one")
+
+    def _check_begun(self) -> None:
+        self._check_open()
+        if not self._begun:
+            raise ResetNeeded("no dream has begun: call reset first")

@@ -29,7 +29,7 @@ SHARPNESS = 5.0  # of a soft bound: 0.5 inside it, a value moves by 0.02
 
 
 class VAE(nn.Module):
-    """V: pictures -> latent z -> pictures.
+    """V: pictures (batch, 3, 64, 64) -> z -> pictures; frames in [0, 1], differences in [-1, 1].
 
     Args:
         variant: one of DIFFERENCE; ValueError for another.
@@ -75,21 +75,13 @@ class VAE(nn.Module):
     def encode(
         self, frame: torch.Tensor, difference: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """q(z | x) = N(mu, exp(logvar)): mu and logvar, (batch, latent_size) each.
-
-        Args:
-            frame: float32 (batch, 3, 64, 64) in [0, 1].
-            difference: the same in [-1, 1]; ignored by a V that does not see it.
-        """
+        """q(z | x) = N(mu, exp(logvar)): mu and logvar, (batch, latent_size) each."""
         seen = torch.cat([frame, difference], 1) if self.sees_difference else frame
         mu, logvar = self.encoder(seen).chunk(2, dim=1)
         return mu, soft_bound(logvar, *LOGVAR_RANGE)
 
     def decode(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor | None]:
-        """z (batch, latent_size) -> the frame, and the difference image or None.
-
-        Shapes and ranges are those of `encode`; None if V does not reconstruct the difference.
-        """
+        """z (batch, latent_size) -> the frame, and the difference image or None."""
         parts = self.decoder(z).split(3, dim=1)
         # Copies: sigmoid and tanh are several times slower on a part of an array.
         parts = [part.contiguous(memory_format=torch.channels_last) for part in parts]
@@ -167,10 +159,7 @@ def vae_losses(
     free_bits: float = 0.0,
     difference_weight: float = 1.0,
 ) -> dict[str, torch.Tensor]:
-    """The loss of V, "total", and its terms; means over the batch.
-
-    "frame_error" and, if it is reconstructed, "difference_error" are squared errors, summed over a
-    picture; "kl" is in nats, without `free_bits`.
+    """V's loss "total" and its terms: squared errors of a picture, and "kl" in nats; batch means.
 
     Args:
         frame, difference: as for `VAE.encode`; a V that reconstructs the difference needs it, too.

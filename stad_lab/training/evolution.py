@@ -159,7 +159,6 @@ def resume(config: Config, folder: Path, world_model: WorldModel, log: dict) -> 
     Raises:
         ValueError: the log was changed, comes from another machine, or its last validated C does
             not follow from the search space in `folder`.
-        FileNotFoundError, ValueError: as `search_space`.
     """
     space, generations = search_space(config, world_model, folder), log["generations"]
     strategy, means = replay(space.first, config.evolution, log)

@@ -265,9 +265,10 @@ def test_many_dreams_at_once_are_those_of_single_environments():
 
 
 def test_dreams_that_are_not_begun_closed_or_given_nonsense_say_so():
-    envs = make_dreams(max_frames=1, autoreset_mode="Disabled")
-    with pytest.raises(ResetNeeded):
-        envs.step(np.zeros((3, 3)))
+    envs = make_dreams(max_frames=1, autoreset_mode="Disabled", render_mode="rgb_array")
+    for act in (lambda: envs.step(np.zeros((3, 3))), envs.render):
+        with pytest.raises(ResetNeeded):
+            act()
     envs.reset(seed=0)
     for actions in (np.zeros((2, 3)), np.full((3, 3), np.nan)):
         with pytest.raises(ValueError, match="expected finite numbers of shape"):
