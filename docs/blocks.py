@@ -102,8 +102,8 @@ def gains(claims: dict) -> str:
     if out_of_reach(study, "z, h"):
         both += "; the paper's gain was out of reach"
     return (
-        "Does it help to see and reconstruct what has moved? A paper says so. We trained each"
-        f" kind twelve times. With a memory, as the paper's controller probably has it: {both}."
+        "Does it help to see and reconstruct what has moved? A paper says so. We trained agents"
+        f" with and without it twelve times each. With a memory, as the paper's controller probably has it: {both}."
         f" Without: {alone}."
     )
 
