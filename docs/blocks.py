@@ -103,8 +103,8 @@ def gains(claims: dict) -> str:
         both += "; the paper's gain was out of reach"
     return (
         "Does it help to see and reconstruct what has moved? A paper says so. We trained agents"
-        f" with and without it twelve times each. With a memory, as the paper's controller probably has it: {both}."
-        f" Without: {alone}."
+        " with and without it twelve times each. With a memory, as the paper's controller probably"
+        f" has it: {both}. Without: {alone}."
     )
 
 

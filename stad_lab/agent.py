@@ -55,7 +55,7 @@ class Agent:
 
     def reset(self) -> None:
         """Forget the past: every episode begins with this."""
-        self.memory = FrameMemory(self.world_model.stride)
+        self.frame_memory = FrameMemory(self.world_model.stride)
         self.cars: Any = None  # which of the first step's cars still drive, an array (cars,)
         self.state: Any = None  # these are arrays from the first step on
         self.latents: Any = None
@@ -82,8 +82,8 @@ class Agent:
             seen = [to_frame(observation, self.world_model.crop_bar) for observation in seen]
         frames = np.asarray(seen)
         if self.state is None:
-            self.cars, self.state = np.arange(len(frames)), self._no_memory(len(frames))
-        self.latents = self.inference.encode(frames, self.memory.push(frames))
+            self.cars, self.state = np.arange(len(frames)), self._zero_state(len(frames))
+        self.latents = self.inference.encode(frames, self.frame_memory.push(frames))
         self.hidden = self.state[0]
         actions = control(self.present_parameters(), self.features())
         if self.remembers:
@@ -104,7 +104,7 @@ class Agent:
         """
         self._check_acted()
         if before is None:
-            before = self._no_memory(len(self.latents))
+            before = self._zero_state(len(self.latents))
         self.state = self.inference.remember(self.latents, actions, before)
 
     def present_parameters(self) -> np.ndarray:
@@ -115,12 +115,12 @@ class Agent:
         """Continue with some of the present cars, by their indices, until the next reset."""
         self._check_acted()
         cars = car_numbers(cars, len(self.cars))
-        self.memory.keep(cars)
+        self.frame_memory.keep(cars)
         self.state = self.state[:, cars]
         self.latents, self.hidden = self.latents[cars], self.hidden[cars]
         self.cars = self.cars[cars]
 
-    def _no_memory(self, cars: int) -> np.ndarray:
+    def _zero_state(self, cars: int) -> np.ndarray:
         return np.zeros((2, cars, self.mdn_rnn.hidden_size), np.float32)
 
     def _check_acted(self) -> None:

@@ -133,9 +133,9 @@ class EvolutionConfig:
     max_frames: int = 1000
     """Frames of a training or validation episode, at most."""
     cars: int = 16
-    """Cars that drive in one batch, at most. Fewer keep more processes busy."""
+    """Cars that drive in one batch, at most. Fewer keep more threads busy."""
     validate_every: int = 5
-    """Generations between two validations of the mean controller."""
+    """Generations between two validations of the averaged mean."""
     validation_tracks: int = 16
     """Tracks of a validation."""
     averaged_share: float = 0.4

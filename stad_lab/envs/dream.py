@@ -68,17 +68,16 @@ class DreamEnv(gym.Env):
         options = check_options(options)
         self.generator = torch.Generator().manual_seed(int(self.np_random.integers(2**31)))
         size, zeros = self.vae.latent_size, torch.zeros(1, 1, self.mdn_rnn.hidden_size)
-        latents = options.get("latents")
+        latents, state = options.get("latents"), options.get("state")
         if latents is None:
             latents = self.np_random.standard_normal(size)
-        self.latents = torch.tensor(finite_array("latents", latents, (size,), "z of V"))
-        state = options.get("state")
-        self.state = (zeros, zeros.clone()) if state is None else state
-        if not isinstance(self.state, tuple | list) or len(self.state) != 2:
-            raise ValueError(f"state={shown(self.state)}: expected M's memory (h, c)")
-        parts = (("memory", part, tuple(zeros.shape), "h and c of one car") for part in self.state)
-        self.state = tuple(torch.from_numpy(finite_array(*part)) for part in parts)
-        self.frames = 0
+        latents = finite_array("latents", latents, (size,), "z of V")
+        state = (zeros, zeros) if state is None else state
+        if not isinstance(state, tuple | list) or len(state) != 2:
+            raise ValueError(f"state={shown(state)}: expected M's memory (h, c)")
+        parts = (("memory", part, tuple(zeros.shape), "h and c of one car") for part in state)
+        self.state = tuple(torch.tensor(finite_array(*part)) for part in parts)
+        self.latents, self.frames = torch.tensor(latents), 0
         return self.latents.numpy().copy(), {"hidden": self.hidden}
 
     @property
@@ -96,8 +95,8 @@ class DreamEnv(gym.Env):
         )
         self.latents = prediction.sample(self.temperature, self.generator)[0, 0]
         self.frames += 1
-        ended = self.frames >= self.max_frames
-        return self.latents.numpy().copy(), 0.0, False, ended, {"hidden": self.hidden}
+        truncated = self.frames >= self.max_frames
+        return self.latents.numpy().copy(), 0.0, False, truncated, {"hidden": self.hidden}
 
     @torch.no_grad()
     def render(self) -> np.ndarray | None:

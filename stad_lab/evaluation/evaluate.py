@@ -49,7 +49,7 @@ def evaluate(
     Args:
         source: of the agent, as for `load_agent`.
         episodes: number of tracks, each driven once, to its end.
-        fast: render with the fast renderer instead of Gymnasium's own.
+        fast: drive in our engine instead of Gymnasium's environment.
         processes: processes, or threads if `fast`; the numbers do not depend on them.
         executor: where episodes run; None for so many workers of this machine.
         unfinished: file that keeps what was driven, so that an interrupted evaluation continues.

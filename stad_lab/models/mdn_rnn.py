@@ -15,7 +15,7 @@ from torch import nn
 from stad_lab.models.controller import ACTION_SIZE
 from stad_lab.models.vae import soft_bound
 
-LOGSIGMA_RANGE = (-5.0, 3.0)  # narrower, and the likelihood of a single latent would diverge
+LOGSIGMA_RANGE = (-5.0, 3.0)  # without the lower bound a likelihood could grow without limit
 
 State = tuple[torch.Tensor, torch.Tensor]  # h and c of the LSTM, each (1, batch, hidden_size)
 
@@ -113,15 +113,14 @@ class MDNRNN(nn.Module):
 def mdn_loss(mixture: Mixture, target: torch.Tensor) -> torch.Tensor:
     """Negative log-likelihood of `target` (batch, time, latent_size), nats per latent: a scalar.
 
-    It is the logarithm of a density, so it may be negative.
+    It is minus the logarithm of a density, so it may be negative.
     """
     return -mixture.log_likelihood(target).mean()
 
 
 def to_state(memory: np.ndarray | None) -> State | None:
     """h and c, float32 (2, batch, hidden_size), as the LSTM takes them: copies; None stays None."""
-    state = None if memory is None else torch.tensor(memory)
-    return None if state is None else (state[:1], state[1:])
+    return None if memory is None else tuple(torch.tensor(memory).split(1))
 
 
 def check_temperature(temperature: float) -> None:

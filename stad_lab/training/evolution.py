@@ -68,9 +68,9 @@ def evolve(
 ) -> bool:  # fmt: skip
     """Evolve C for the V and M in `folder`; False if the run was complete already.
 
-    All agents of a generation drive the same tracks; their fitness is their mean return. Every few
-    generations the averaged mean of CMA-ES drives the validation tracks, and the best one so far is
-    kept: to keep the best *candidate* would be to keep the one with the easiest tracks.
+    The candidates of a generation drive the same tracks; their fitness is their mean return. Every
+    few generations the averaged mean of CMA-ES drives the validation tracks, and the best one so
+    far is kept: to keep the best *candidate* would be to keep the one with the easiest tracks.
 
     Args:
         executor: where episodes run; None for `config.processes` threads of this machine.
@@ -115,6 +115,7 @@ def run_generation(run: Evolution, executor: Executor, source: Any) -> None:
     candidates = run.space.expand(population)
     entry = drive_generation(executor, source, run.config, generations, candidates)
     tell(run.strategy, population, entry["returns"], run.means)
+    # Sigma as CMA-ES leaves it; with `sigma_decay` the next `ask` overwrites it.
     entry |= {"sigma": float(run.strategy.sigma), "mean_checksum": crc(run.strategy.mean)}
     if entry["generation"] % settings.validate_every == 0:
         entry["validation"] = validate(executor, source, run.config, run.controller())
@@ -163,10 +164,10 @@ def resume(config: Config, folder: Path, world_model: WorldModel, log: dict) -> 
     space, generations = search_space(config, world_model, folder), log["generations"]
     strategy, means = replay(space.first, config.evolution, log)
     run = Evolution(config, folder, world_model, space, log, strategy, means)
-    last = max((n for n, entry in enumerate(generations, 1) if "validation" in entry), default=0)
-    if last:
-        validated = generations[last - 1]["validation"]["controller_checksum"]
-        if crc(run.controller(last)) != validated:
+    validated = [entry for entry in generations if "validation" in entry]
+    if validated:
+        last = validated[-1]
+        if crc(run.controller(last["generation"])) != last["validation"]["controller_checksum"]:
             raise ValueError(
                 f"{folder} holds other components, or another first C, than the run in"
                 f" {folder / LOG} had: restore the right files, or start in a new folder"
@@ -198,7 +199,7 @@ def make_strategy(start: np.ndarray, settings: EvolutionConfig, random: dict) ->
 
 
 def ask(strategy: "Strategy", settings: EvolutionConfig, generation: int) -> np.ndarray:
-    """The population of a generation, counted from 0: float64 (agents, dimensions).
+    """The population of a generation, counted from 0: float64 (candidates, dimensions).
 
     With `sigma_decay` the step size follows a schedule: in hundreds of dimensions CMA-ES takes
     dozens of generations to adapt it.
@@ -209,7 +210,7 @@ def ask(strategy: "Strategy", settings: EvolutionConfig, generation: int) -> np.
 
 
 def tell(strategy: "Strategy", population: np.ndarray, returns: list, means: list) -> None:
-    """Tell CMA-ES, which minimises, the returns (agents, tracks); adds its mean to `means`."""
+    """Tell CMA-ES, which minimises, the returns (candidates, tracks); adds its mean to `means`."""
     strategy.tell(population, [-np.mean(own) for own in returns])
     means.append(strategy.mean.copy())
 
@@ -246,9 +247,9 @@ def kept_generation(folder: Path, log: dict) -> int | None:
         return None
     parameters, metadata = weights.load_controller(path)
     generation = metadata.get("generation")
-    entries = [entry for entry in log["generations"] if entry["generation"] == generation]
-    validations = [entry["validation"] for entry in entries if "validation" in entry]
-    if [crc(parameters)] != [one["controller_checksum"] for one in validations]:
+    validated = [entry for entry in log["generations"] if "validation" in entry]
+    known = {one["generation"]: one["validation"]["controller_checksum"] for one in validated}
+    if crc(parameters) != known.get(generation):
         raise ValueError(
             f"{path} does not come from the run in {folder / LOG}: move it away, and the same"
             " command writes the right one"
@@ -280,8 +281,8 @@ def crc(vector: np.ndarray) -> int:
 def generation_tracks(config: Config, earlier: list[dict]) -> list[int]:
     """The tracks of the generation after the `earlier` ones: new ones, and some hard ones again.
 
-    On an easy track the fastest agents win, even if they lose hundreds of points elsewhere. So a
-    share `replay_share` of the tracks is replayed: those on which the mean return of the agents was
+    On an easy track the fastest candidates win, even if they lose hundreds of points elsewhere. So
+    a share `replay_share` of the tracks is replayed: those on which the candidates' mean return was
     lowest when last driven, among the last REMEMBERED generations without the last RESTING ones. It
     is a simple form of prioritized level replay (Jiang, Grefenstette and Rocktaschel, 2021).
     """
@@ -300,20 +301,19 @@ def generation_tracks(config: Config, earlier: list[dict]) -> list[int]:
 
 
 def drive_generation(
-    executor: Executor, source: Any, config: Config, earlier: list[dict], population: np.ndarray
+    executor: Executor, source: Any, config: Config, earlier: list[dict], candidates: np.ndarray
 ) -> dict:
-    """Let every agent drive the next generation's tracks; returns its entry of the log.
+    """Let every candidate drive the next generation's tracks; returns its entry of the log.
 
-    `source` is from `hand_out`; `population` holds controllers, float64 (agents, parameters).
+    `source` is from `hand_out`; `candidates` are controllers, float64 (candidates, parameters).
     """
     tracks = generation_tracks(config, earlier)
-    agents = np.repeat(population, len(tracks), axis=0)
-    repeated = tracks * len(population)
-    returns, lengths = drive_parallel(executor, source, config.evolution, agents, repeated)
+    repeated = np.repeat(candidates, len(tracks), axis=0), tracks * len(candidates)
+    returns, lengths = drive_parallel(executor, source, config.evolution, *repeated)
     return {
         "generation": len(earlier) + 1,
         "tracks": tracks,
-        "returns": returns.reshape(len(population), len(tracks)).tolist(),
+        "returns": returns.reshape(len(candidates), len(tracks)).tolist(),
         "frames": int(lengths.sum()),
     }
 
@@ -383,6 +383,6 @@ def make_agent(source: Path | WorldModel, parameters: np.ndarray) -> Agent:
 
 
 def fitness_curves(generations: list[dict]) -> np.ndarray:
-    """Worst, mean and best fitness (an agent's mean return), float64 (3, generations)."""
+    """Worst, mean and best fitness (a candidate's mean return), float64 (3, generations)."""
     fitness = [np.mean(entry["returns"], axis=1) for entry in generations]
     return np.array([[own.min(), own.mean(), own.max()] for own in fitness]).T

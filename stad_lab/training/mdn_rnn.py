@@ -46,14 +46,14 @@ def train_mdn_rnn(
     """
     path = Path(folder) / MDN_RNN_FILE
     if path.exists():
-        check_vae(config, None, folder)
+        check_vae(config, folder)
         check_mdn_rnn(config, folder)
         path.with_name(CHECKPOINT).unlink(missing_ok=True)  # of a process that was killed
         if watch:
             watch(weights.load_mdn_rnn(path)[1]["history"])
         return False
     data = dataset()
-    check_vae(config, data.checksum, folder)
+    check_vae(config, folder, data.checksum)
     vae, metadata = load_vae(path.with_name(VAE_FILE))
     if config.mdn_rnn.steps:
         check_lengths(data, config.mdn_rnn.sequence)  # before V encodes the whole dataset

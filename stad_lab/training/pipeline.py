@@ -150,7 +150,7 @@ def check_stages(config: Config, folder: Path, data: Path) -> None:
     if not config.data.agent_episodes:
         read_manifest(data, made_with(config))
     if (folder / VAE_FILE).exists():
-        seen = check_vae(config, None, folder)["dataset"]
+        seen = check_vae(config, folder)["dataset"]
         check_seen(folder / VAE_FILE, seen, data)
         # Without V, for example because a damaged one was deleted, M is checked when V is trained.
         if (folder / MDN_RNN_FILE).exists():

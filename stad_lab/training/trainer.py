@@ -1,8 +1,8 @@
 """One training loop for V and for M: Adam, a falling learning rate, checkpoints and a history.
 
-Step s depends on the seed, s and the weights alone, because its batch is drawn from a Generator of
-its own. So a resumed training makes the same updates as one that was not interrupted: bit-identical
-on the CPU with as many threads, and nearly so on a GPU.
+Step s depends on the seed, s, the weights and Adam's moments alone, because its batch is drawn from
+a Generator of its own. So a resumed training makes the same updates as an uninterrupted one:
+bit-identical on the CPU with as many threads, and nearly so on a GPU.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from stad_lab.io.files import load_into, load_tensors, save_tensors
 from stad_lab.io.memory import keep_freed_memory, return_freed_memory
 from stad_lab.io.workers import interrupted_at_the_end
 
-ENTRIES = 20  # of the history, and checkpoints, in a training
+ENTRIES = 20  # of the history, and checkpoints, at least, in a training
 LARGEST_NORM = 100.0  # of the gradient, which is shortened to it
 LAST_RATE = 0.1  # learning rate at the end, as a share of that at the start
 
@@ -71,8 +71,8 @@ def fit(training: Training) -> list[dict]:
     batches = read_ahead(training.batch, range(start, steps))
     progress = tqdm(batches, training.label, steps, initial=start, unit="step")
     try:
-        for step, present in progress:
-            losses = training.losses(*present)
+        for step, batch in progress:
+            losses = training.losses(*batch)
             check_finite(losses["total"].item(), training.label, step)
             update(training.model, optimizer, losses["total"], learning_rate(training, step))
             sums.update({name: loss.item() for name, loss in losses.items()})
@@ -128,7 +128,7 @@ def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[in
     with ThreadPoolExecutor(1) as reader:
         following: Any = reader.submit(batch, steps.start) if steps else None
         for step in steps:
-            with interrupted_at_the_end():  # within them it leaves a lock that nobody releases
+            with interrupted_at_the_end():  # in these calls it leaves a lock that nobody releases
                 ready = following.result()
                 following = reader.submit(batch, step + 1) if step + 1 < steps.stop else None
             yield step, ready
@@ -138,7 +138,7 @@ def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[in
 def torch_settings(seed: int, number: int) -> Iterator[torch.device]:
     """Seed torch for a `with` block that trains model `number` (V: 0, M: 1); yields its device.
 
-    On a GPU, too, sums are float32 and repeat bit by bit. The caller's random state, default dtype
+    On a GPU, too, sums are float32. The caller's random state, default dtype
     and gradient mode are the same afterwards.
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or sums of an LSTM may differ

@@ -38,7 +38,7 @@ def train_vae(
     """
     path = Path(folder) / VAE_FILE
     if path.exists():
-        history = check_vae(config, None, folder)["history"]
+        history = check_vae(config, folder)["history"]
         path.with_name(CHECKPOINT).unlink(missing_ok=True)  # of a process that was killed
         if watch:
             watch(history)
@@ -65,12 +65,12 @@ def vae_depends_on(config: Config) -> dict:
     }
 
 
-def check_vae(config: Config, dataset: str | None, folder: Path) -> dict:
+def check_vae(config: Config, folder: Path, dataset_checksum: str | None = None) -> dict:
     """V's metadata. ValueError if damaged, or of another configuration or dataset (None: any)."""
     path = Path(folder) / VAE_FILE
     metadata = load_vae(path)[1]
     check_same(path, metadata, vae_depends_on(config))
-    if dataset and metadata["dataset"] and dataset != metadata["dataset"]:
+    if dataset_checksum and metadata["dataset"] and metadata["dataset"] != dataset_checksum:
         raise ValueError(f"{path} was trained on another dataset: give its own one")
     return metadata
 

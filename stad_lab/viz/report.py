@@ -91,7 +91,9 @@ def curves_of_evolution(generations: list[dict]) -> list[Figure]:
     numbers = np.array([entry["generation"] for entry in generations])
     return [
         plots.plot_evolution(fitness_curves(generations), validated, "The evolution of C"),
-        plots.plot_curves(sigma, "Step size of CMA-ES", "generation", "sigma", x=numbers),
+        plots.plot_curves(
+            sigma, "Step size after the update of CMA-ES", "generation", "sigma", x=numbers
+        ),
     ]
 
 
