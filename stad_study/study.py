@@ -55,7 +55,7 @@ from stad_study.run import share_world_model
 from stad_study.tables import PIPELINE
 
 SCORE = "score.json"
-CARS = 16  # cars that drive in one batch: another number would change last bits of the returns
+CARS = 16  # cars that drive in one batch
 THREADS = 1  # that train V and M, on every machine: last bits depend on their number
 WAIT = 120.0  # seconds to wait for another process that writes the tables
 COLLECTING = 3600.0  # seconds to wait for another process that collects the dataset

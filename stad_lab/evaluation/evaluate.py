@@ -77,7 +77,7 @@ def evaluate(
     missing = [track for track in tracks if str(track) not in driven]
     workers = worker_threads if fast else worker_processes
     with workers(processes, executor) as executor:
-        # One car at a time: in a batch the last bits differ from those of a car that drives alone.
+        # One car at a time, so that each result is kept as soon as it is there.
         share = hand_out(executor, run_folder(source))
         tasks = [(share, agent.parameters, [track], fast) for track in missing]
         results = run_tasks(executor, drive_group, tasks)

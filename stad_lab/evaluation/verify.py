@@ -205,7 +205,7 @@ def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
             tasks = [(source, parameters, track, not official) for track in tracks]
             found = run_in_order(executor, evolution.drive_group, tasks)
             driven = [float(returns[0]) for returns, _ in found]
-        else:  # all tracks, because last bits depend on the cars that drive in one batch
+        else:  # `validate` drives all of its tracks
             _, log = logged(folder, config)
             kept = evolution.kept_generation(folder, log)
             assert kept is not None  # there is a controller
