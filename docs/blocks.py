@@ -156,8 +156,10 @@ def cause_table(study: dict) -> str:
             cells = (title, difference_of(one), f"{low:.1f} to {high:.1f}")
             tests = [p_value(one[key]) for key in ("p", "holm_p") if key in one] or ["", ""]
             outcome = one.get("verdict", "described")
-            if outcome == "gain" and one["interval"][1] < MARGIN:
+            if outcome in ("gain", "harm") and max(map(abs, one["interval"])) < MARGIN:
                 outcome += f", of fewer than {MARGIN} points"
+            if outcome == "undecided":
+                outcome += f" ({one['seeds_that_decide']} seeds)"
             lines.append((*cells, *tests, outcome))
     head = ("comparison", "difference (95% interval)", "t-interval", "p", "Holm's p", "verdict")
     return table(head, lines)

@@ -207,6 +207,8 @@ def add_run(study: Evolved, run: EvolvedRun, root: Path, to: Path) -> None:
     line = pandas.DataFrame([key | describe_run(run, root)])
     networks = to.parent / NETWORKS.name / study.name
     with locked(to, WAIT):
+        if recorded(study, run, to):
+            raise ValueError(f"{run.name} came into {to} from another folder: nothing was added")
         add_controller(study, run, np.array(score["controller"]), networks)
         tables.replace_lines(f"{study.name}_returns", pandas.DataFrame([key | returns]), to)
         tables.replace_lines(f"{study.name}_runs", line, to)

@@ -104,8 +104,8 @@ def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
     rows = {title: comparisons[name] for name, title in titles.items() if name in comparisons}
     figure, ((axis,),) = new_figure(8.6, 1.4 + 0.55 * len(rows))
     draw_margin(axis, margin)
-    for height, one in enumerate(rows.values()):
-        plot_comparison(axis, height, one, COLOURS["input_output"])
+    for height, (title, one) in enumerate(rows.items()):
+        plot_comparison(axis, height, one, COLOURS[title.split()[0].rstrip(":")])
     name_rows(axis, [title.replace(", minus", ",\nminus") for title in rows])
     axis.set_xlabel("difference, points")
     legend_below(figure, axis)

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 import pandas
 
-from stad_lab.evaluation import statistics
 from stad_study import tables
 from stad_study.evolved import describe_counts
 from stad_study.study import STUDIES
 from stad_study.study5 import ARMS, REPEATS, STUDY5
-from stad_study.study_claims import compare_arms, find_verdict, mean_curve
+from stad_study.study_claims import compare_arms, judge, mean_curve
 
 RELEVANT = "relevant difference"  # some arms lead, others trail
 Families = dict[tuple[str, ...], dict[str, tuple[dict[str, float], ...]]]
@@ -77,6 +76,10 @@ def scores_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndar
     if parts and (list(map(int, table)) != list(tracks) or table.isna().any(axis=None)):
         where = f"the tracks {tracks[0]} to {tracks[-1]}"
         raise ValueError(f"study5_returns: expected a return of each run on {where}")
+    means = tables.read_or_empty("study5_runs", folder).set_index(tables.SENSED)["mean"]
+    apart = (table.mean(axis=1) - means).abs() > 0.01  # returns are kept to a cent
+    if parts and apart.any():
+        raise ValueError(f"study 5: mean and returns differ: {apart[apart].index.tolist()}")
     return by_arm(table, parts)
 
 
@@ -93,7 +96,10 @@ def processors_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, dic
 def curves_of(parts: list[str], folder: Path = tables.DATA) -> dict[str, np.ndarray]:
     """Arm -> validation means (seeds, validations), averaged over the runs of each seed."""
     table = tables.read_or_empty("study5_runs", folder).set_index(tables.SENSED)
-    return by_arm(table.filter(like="validation."), parts)
+    table = table.filter(like="validation.")
+    if parts and table.isna().any(axis=None):
+        raise ValueError("study5_runs: expected every validation of each run")
+    return by_arm(table, parts)
 
 
 def by_arm(table: pandas.DataFrame, parts: list[str]) -> dict[str, np.ndarray]:
@@ -128,8 +134,7 @@ def compare_family(scores: dict[str, np.ndarray], comparisons: dict, tested: boo
         if not tested:
             del found[name]["p"]
     if tested:
-        adjusted = statistics.holm([one["p"] for one in found.values()])
-        for one, p in zip(found.values(), adjusted, strict=True):
-            verdict = find_verdict(one["interval"], p).replace("relevant gain", RELEVANT)
-            one |= {"holm_p": p, "verdict": verdict}
+        judge(found)
+        for one in found.values():
+            one["verdict"] = one["verdict"].replace("relevant gain", RELEVANT)
     return found

@@ -91,15 +91,20 @@ def compare_family(
             faster = areas[arms[1]] - areas[arms[0]]
             found[arms[1]]["area_difference"] = float(faster.mean())
             found[arms[1]]["area_interval"] = statistics.bootstrap(faster[:, None])
-    adjusted = statistics.holm([one["p"] for one in found.values()])
-    for one, p in zip(found.values(), adjusted, strict=True):
+    judge(found)
+    return found
+
+
+def judge(comparisons: dict[str, dict]) -> None:
+    """Give each comparison of a family Holm's p, a verdict, and the seeds that would decide."""
+    adjusted = statistics.holm([one["p"] for one in comparisons.values()])
+    for one, p in zip(comparisons.values(), adjusted, strict=True):
         one["holm_p"] = p
         one["verdict"] = find_verdict(one["interval"], p)
         deviation = float(np.std(one["by_seed"], ddof=1))
         more = len(one["by_seed"]) + 1  # reported only if undecided, so more than were run
-        seeds = max(more, statistics.pairs_that_decide(deviation, MARGIN, len(found)))
+        seeds = max(more, statistics.pairs_that_decide(deviation, MARGIN, len(comparisons)))
         one |= {"deviation": deviation, "seeds_that_decide": seeds}
-    return found
 
 
 def compare_arms(frame: np.ndarray, variant: np.ndarray) -> dict:

@@ -22,7 +22,7 @@ from stad_lab.training.evolution import LOG
 from stad_lab.training.trainer import torch_settings
 from stad_study import senses, study5, tables, world_facts
 from stad_study.cli import main
-from stad_study.evolved import compare_run, find_runs, recorded, run_evolved
+from stad_study.evolved import add_run, compare_run, find_runs, recorded, run_evolved
 from stad_study.networks import WORLD_MODEL_FILE, keep_world_model, load_kept_world_model
 from stad_study.senses import (
     COLUMNS,
@@ -85,6 +85,13 @@ def test_every_arm_has_three_runs_a_seed_with_their_own_evolution_seeds():
     assert len({run.name for run in runs}) == len(runs) == 12 * 3
     assert {run.config.evolution.seed for run in runs} == {101, 102, 103}
     assert [run.sees for run in runs[:6]] == ["z", "z, h"] * 3
+
+
+def test_a_run_that_came_into_the_tables_meanwhile_is_not_replaced(made):
+    before = tables.read("study5_runs", made / "data")
+    with pytest.raises(ValueError, match="from another folder: nothing was added"):
+        add_run(STUDY5, find_runs(STUDY5)[0], made / "study5", made / "data")
+    assert tables.read("study5_runs", made / "data").equals(before)
 
 
 def test_the_runs_of_a_repeat_drive_the_same_tracks_and_are_in_the_tables(made):

@@ -69,6 +69,19 @@ def test_nothing_is_tested_before_the_last_run_of_a_part(tmp_path, unfinished):
         assert hidden not in found["arms"]
 
 
+@pytest.mark.parametrize(
+    ("column", "number", "message"),
+    [("mean", 0.0, "mean and returns differ"), ("validation.5", np.nan, "every validation")],
+)
+def test_a_line_of_runs_that_does_not_fit_is_refused(complete, tmp_path, column, number, message):
+    shutil.copytree(complete, tmp_path, dirs_exist_ok=True)
+    table = tables.read("study5_runs", tmp_path)
+    table.loc[5, column] = number
+    tables.save("study5_runs", table, tmp_path)
+    with pytest.raises(ValueError, match=message):
+        describe_study5(tmp_path)
+
+
 @pytest.mark.parametrize("spoil", ["a return is missing", "a track is missing"])
 def test_a_table_with_a_gap_is_refused(complete, tmp_path, spoil):
     shutil.copytree(complete, tmp_path, dirs_exist_ok=True)
@@ -131,6 +144,8 @@ def test_the_page_shows_the_tests_of_complete_parts_alone(
     assert len(lines) == rows and ("../notebooks/pictures/study5.png" in page) == (rows > 0)
     assert f"5c {max(0, 144 - missing)} of 144" in page
     assert ("study5" in blocks.drawable(claims)) == (rows > 0)
+    if rows == 11:
+        assert "harm |" in page and ", of fewer than 30 points |" in page
     if rows:
         axis = blocks.FIGURES["study5"](claims).axes[0]
         drawn = [list(line.get_xdata()) for line in axis.lines]

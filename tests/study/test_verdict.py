@@ -97,19 +97,21 @@ def cause_with(changed=()):
 
 
 def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_for():
-    assert describe_cause(cause_with())[-1].endswith("the motion explains the gain.")
+    assert "by its rule the motion explains the gain" in describe_cause(cause_with())[-1]
     for name, missing in (
-        ("interaction", "the effect is larger with z"),
+        ("interaction", "difference images are worth more with z alone"),
         ("adding motion", "adding the motion is a gain"),
         ("erasing motion", "erasing it is a harm"),
         (
             "both with motion",
-            "with the motion the variants differ by less than 30 points (not tested)",
+            "with the motion the variants are within 30 points (no test)",
         ),
     ):
         reading = describe_cause(cause_with({name: [-31.0, 29.0]}))[-1]
         shown, _, not_shown = reading.partition("Not shown: ")
         assert "is not shown" in shown and missing not in shown and not_shown == f"{missing}."
+    reading = describe_cause(cause_with({"adding motion": [-60.0, -5.0]}))[-1]
+    assert "adding the motion is a gain (it is a harm)" in reading
     names = ("interaction", "adding motion", "erasing motion", "both with motion")
     reading = describe_cause(cause_with({name: [-40.0, 40.0] for name in names}))[-1]
     assert "Shown: nothing." in reading

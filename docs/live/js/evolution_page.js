@@ -108,7 +108,7 @@ stad.start(async () => {
     stad.get("dream-text").textContent = `generation ${generations[chosen]}, ${seconds} s`;
     stad.describe(
       stad.get("dream"),
-      `M's dream, driven by the mean controller of generation ${generations[chosen]}, after ${seconds} seconds.`,
+      `M's dream, driven by the mean driver of generation ${generations[chosen]}, after ${seconds} seconds.`,
     );
   }
 
@@ -188,7 +188,7 @@ stad.start(async () => {
   const setDream = (on) => {
     if (on) clock.play();
     else clock.pause();
-    stad.get("dream-play").textContent = on ? "Pause the car and the dream" : "Drive";
+    stad.get("dream-play").textContent = on ? "Pause the car and the dream" : "Go on";
   };
 
   slider.max = last;

@@ -204,7 +204,7 @@ stad.start(async () => {
   });
   for (const name of stad.evolveSettings.NAMES)
     get(name).addEventListener("change", () => {
-      get("warning").textContent = "It applies after a fresh start.";
+      get("warning").textContent = "Press Start afresh to apply it.";
     });
   get("restart").addEventListener("blur", () => {
     get("warning").textContent = "";

@@ -74,8 +74,8 @@ stad.start(async () => {
       get(id).value = axes[place];
     }
     const [sees, decodes] = [vae.seesDifference, vae.reconstructsDifference];
-    get("sees-frame").textContent = "V sees it.";
-    get("sees-difference").textContent = sees ? "V sees it." : "This V does not see it.";
+    get("sees-frame").textContent = "seen by V";
+    get("sees-difference").textContent = sees ? "seen by V" : "not seen by this V";
     get("decodes-difference").lastChild.textContent = decodes
       ? "Decoded difference"
       : "This V decodes no difference image.";

@@ -74,7 +74,7 @@ stad.figure("eye", async (part) => {
     part("veil").hidden = true;
     part("after").hidden = false;
     decode();
-    const text = "The squares are gone: leaving them out costs the least error for its 32 numbers.";
+    const text = "The squares are gone: leaving them out adds the least error.";
     part("answer").textContent = text;
     stad.announce(text);
     return LOST;

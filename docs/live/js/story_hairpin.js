@@ -39,7 +39,7 @@ stad.figure("hairpin", async (part) => {
     const near = Math.min(apart, track.count - apart) < 20;
     const text = tile === undefined
       ? `It stayed on the road, with ${car.score.toFixed(0)} points.`
-      : `${near ? "You found it" : "It was elsewhere"}: it first left the road after ${(lost[0].frame / 50).toFixed(1)} seconds, at the first red dot. ${car.score.toFixed(0)} points.`; // prettier-ignore
+      : `${near ? "You found it" : "Elsewhere"}: the car first left the road after ${(lost[0].frame / 50).toFixed(1)} seconds, at the first red dot. ${car.score.toFixed(0)} points.`; // prettier-ignore
     part("answer").textContent = text;
     stad.announce(text);
     part("race").hidden = false;

@@ -29,7 +29,7 @@ stad.figure("speed", async (part) => {
   const score = () => {
     const done = Math.min(round + 1, ALL);
     const [first, second] = [Math.min(done, BLIND), Math.max(0, done - BLIND)];
-    const told = `From one frame ${right[0]} of ${first}`;
+    const told = `One frame: ${right[0]} of ${first} right`;
     return second ? `${told}, with the difference image ${right[1]} of ${second}.` : `${told}.`;
   };
   const say = (text) => {

@@ -6,8 +6,7 @@ globalThis.stad ??= {};
 stad.whatIsMissing = () => {
   if (typeof WebAssembly !== "object") return "It needs WebAssembly, which this browser lacks.";
   if (typeof Worker === "undefined") return "It needs workers, which this browser lacks.";
-  if (typeof DecompressionStream === "undefined")
-    return "It needs a newer browser, with DecompressionStream.";
+  if (typeof DecompressionStream === "undefined") return "It needs a newer browser.";
   // A module with one SIMD instruction.
   const simd = [
     0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253,
