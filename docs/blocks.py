@@ -26,6 +26,7 @@ from stad_study.figures import (
     TURNING,
     difference_of,
     plot_cause,
+    plot_cause_curves,
     plot_drivers,
     plot_learning_curves,
     plot_primary,
@@ -143,6 +144,8 @@ def cause(claims: dict) -> str:
         meaning = "**" + " ".join(describe_cause(study)) + "**"
         tables = [cause_table(study), repeated_table(study, claims["study1"])]
         parts = [meaning, image("study5", claims), *tables, *parts]
+        if "study5_curves" in drawable(claims):
+            parts.append(image("study5_curves", claims))
     return "\n\n".join(parts)
 
 
@@ -282,12 +285,18 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
     "study1_primary": lambda claims: plot_primary(claims["study1"]["comparisons"], MARGIN),
     "study3": lambda claims: plot_drivers(claims["study3"]),
     "study5": lambda claims: plot_cause(claims["study5"]["comparisons"], MARGIN),
+    "study5_curves": lambda claims: plot_cause_curves(
+        claims["study5"]["arms"], config.PRESETS["laptop"].evolution.validate_every
+    ),
 }
 
 
 def drawable(claims: dict) -> set[str]:
-    """The names of FIGURES whose data there are: study 5 has one when a part is complete."""
-    return {name for name in FIGURES if name != "study5" or claims["study5"]["comparisons"]}
+    """The names of FIGURES whose data there are: those of study 5 wait for its parts."""
+    comparisons, waiting = claims["study5"]["comparisons"], {"study5", "study5_curves"}
+    if comparisons:
+        waiting = set() if "adding motion" in comparisons else {"study5_curves"}
+    return set(FIGURES) - waiting
 
 
 def image(name: str, claims: dict) -> str:

@@ -14,6 +14,7 @@ from stad_lab.viz.plots import (
     name_rows,
     new_figure,
     plot_intervals,
+    styles_of,
 )
 
 COLOURS = {variant: colour for variant, (colour, _) in VARIANT_STYLES.items()}
@@ -111,6 +112,32 @@ def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
     legend_below(figure, axis)
     told = [f"{title} {difference_of(one)}" for title, one in rows.items()]
     return describe(figure, "Study 5: each C evolved three times", "Means: ", ["; ".join(told)])
+
+
+def plot_cause_curves(arms: dict[str, dict], every: int) -> Figure:
+    """Validation means of the arms of study 5 whose C sees z or a changed z, by generation.
+
+    Args:
+        arms: "VARIANT: SEES" -> "curve" -> "mean", at each validation.
+        every: generations between two validations.
+    """
+    figure, axes = new_figure(8.6, 4.0, 1, 2, sharex=True, sharey=True)
+    told = []
+    for axis, variant in zip(axes[0], ("frame", "input_output"), strict=True):
+        own = {
+            arm.partition(": ")[2]: one["curve"]["mean"]
+            for arm, one in arms.items()
+            if arm.startswith(f"{variant}: z") and not arm.endswith("z, h")
+        }
+        for (sees, mean), (colour, dash) in zip(own.items(), styles_of(own), strict=False):
+            generations = [every * (number + 1) for number in range(len(mean))]
+            axis.plot(generations, mean, dash, color=colour, label=f"C sees {sees}")
+        caption(axis, variant, "generation")
+        axis.legend(fontsize=8, loc="lower right")
+        ends = (f"{sees} {mean[-1]:.0f}" for sees, mean in own.items())
+        told.append(f"{variant}: {', '.join(ends)}")
+    axes[0, 0].set_ylabel("mean on the validation tracks")
+    return describe(figure, "Study 5: learning curves, means of all runs", "At the end: ", told)
 
 
 def plot_scores(arms: dict[str, dict]) -> Figure:

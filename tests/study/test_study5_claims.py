@@ -144,6 +144,15 @@ def test_the_page_shows_the_tests_of_complete_parts_alone(
     assert len(lines) == rows and ("../notebooks/pictures/study5.png" in page) == (rows > 0)
     assert f"5c {max(0, 144 - missing)} of 144" in page
     assert ("study5" in blocks.drawable(claims)) == (rows > 0)
+    assert ("study5_curves.png" in page) == (rows == 11)
+    if rows == 11:
+        panels = blocks.FIGURES["study5_curves"](claims).axes
+        named = [[line.get_label() for line in panel.lines] for panel in panels]
+        seen = "z", "z + motion", "z + placebo", "z + action"
+        assert named[0] == [f"C sees {one}" for one in seen]
+        seen = "z", "z - motion", "z - placebo", "z + motion"
+        assert named[1] == [f"C sees {one}" for one in seen]
+        assert list(panels[0].lines[1].get_ydata()) == [738, 840]
     if rows == 11:
         assert "harm |" in page and ", of fewer than 30 points |" in page
     if rows:
