@@ -488,9 +488,9 @@ def faster_recipe(claims: dict) -> str:
     found = claims["study6"]
     outcome = "does not" if found["not_worse"] else "may"
     return (
-        "With V and M trained on one core, the medians were"
-        f" {found['minutes']['study6_fast']:.0f} minutes for `fast` and"
-        f" {found['minutes']['study6_laptop']:.0f} for `laptop`."
+        f"A run took {found['minutes']['study6_fast']:.0f} minutes with `fast` and"
+        f" {found['minutes']['study6_laptop']:.0f} with `laptop` (medians; V and M trained on one"
+        " core)."
         f" [Study 6](protocol.md#study-6-a-faster-recipe): `fast` {outcome} lose {MARGIN} "
         f"points or more against `laptop`. Over twelve pairs the mean difference is "
         f"{found['difference']:+.1f} points, with a standard deviation of "

@@ -82,7 +82,7 @@ def out_of_reach(study: dict, features: str) -> bool:
 
 
 def describe_paper_gain(study: dict) -> str:
-    """How many intervals end below the gain of the paper, and where none could reach it."""
+    """How many intervals end below the gain of the paper, where it was in reach, and where not."""
     reached = [features for features in SEES if not out_of_reach(study, features)]
     below = [
         one["interval"][1] < PAPER_GAINS[name.partition(": ")[2]]

@@ -138,8 +138,8 @@ def read_ahead(batch: Callable[[int], tuple], steps: range) -> Iterator[tuple[in
 def torch_settings(seed: int, number: int) -> Iterator[torch.device]:
     """Seed torch for a `with` block that trains model `number` (V: 0, M: 1); yields its device.
 
-    On a GPU, too, sums are float32. The caller's random state, default dtype
-    and gradient mode are the same afterwards.
+    On a GPU, too, sums are float32. The caller's random state, default dtype and gradient mode are
+    the same afterwards.
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # or sums of an LSTM may differ
     exact = torch.backends.cudnn.flags(enabled=True, deterministic=True, allow_tf32=False)

@@ -56,7 +56,7 @@ def test_the_finding_of_the_overview_has_at_most_80_words():
     assert len((before + blocks.finding(read_claims())).split()) <= 80
 
 
-def test_the_gains_of_the_paper_are_compared_with_every_interval():
+def test_the_gains_of_the_paper_are_compared_where_they_were_in_reach():
     gain = describe_verdict(study_with(("gain", "harm")))[-1]
     assert "75 to 79 points" in gain and "1 of the 2 intervals with z alone end below them" in gain
     first, second = describe_verdict(study_with(("gain", "harm")))[:2]
@@ -112,6 +112,8 @@ def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_f
         assert "is not shown" in shown and missing not in shown and not_shown == f"{missing}."
     reading = describe_cause(cause_with({"adding motion": [-60.0, -5.0]}))[-1]
     assert "adding the motion is a gain (it is a harm)" in reading
+    reading = describe_cause(cause_with({"erasing motion": [5.0, 60.0]}))[-1]
+    assert "erasing it is a harm (it is a gain)" in reading
     names = ("interaction", "adding motion", "erasing motion", "both with motion")
     reading = describe_cause(cause_with({name: [-40.0, 40.0] for name in names}))[-1]
     assert "Shown: nothing." in reading

@@ -330,7 +330,7 @@ stad.start(async () => {
     const driven = Math.round(100 * you.tiles);
     const name = driver ? "evolved driver" : `agent ${agent}`;
     const text = {
-      attract: `The ${name} drives on track ${seed}. Touch it or press the up arrow to race it.`,
+      attract: `The ${name} drives on track ${seed}. Touch the picture or press the up arrow to race it.`,
       race: `You race on track ${seed}: ${driven}% of the lap, ${mine} points.`,
       paused: `Paused at ${driven}% of the lap.`,
       over: `The race is over: you ${mine}, the agent ${rival.score.toFixed(0)} points.`,

@@ -1,5 +1,5 @@
 "use strict";
-// "Breed a driver": the recorded run of a shipped agent, and a flag on its first lap.
+// "Breed a driver": the recorded run of a shipped agent, and a bet on its first lap.
 
 stad.figure("breed", async (part) => {
   const [run, tensors] = await Promise.all([
