@@ -158,11 +158,9 @@ def cause_table(study: dict) -> str:
             low, high = one["t_interval"]
             cells = (title, difference_of(one), f"{low:.1f} to {high:.1f}")
             tests = [p_value(one[key]) for key in ("p", "holm_p") if key in one] or ["", ""]
-            outcome = one.get("verdict", "described")
+            outcome = verdict_of(one) if "verdict" in one else "described"
             if outcome in ("gain", "harm") and max(map(abs, one["interval"])) < MARGIN:
                 outcome += f", of fewer than {MARGIN} points"
-            if outcome == "undecided":
-                outcome += f" ({one['seeds_that_decide']} seeds)"
             lines.append((*cells, *tests, outcome))
     head = ("comparison", "difference (95% interval)", "t-interval", "p", "Holm's p", "verdict")
     return table(head, lines)
@@ -208,14 +206,18 @@ def comparisons_table(study: dict) -> str:
         for features, variant in itertools.product(SEEN, variants):
             one = study["comparisons"][f"{features}: {variant}"]
             low, high = one["t_interval"]
-            outcome = one["verdict"]
-            if outcome == "undecided":
-                outcome += f" ({one['seeds_that_decide']} seeds)"
             cells = (family, f"`{variant}`, {SEEN[features]}", difference_of(one))
             cells += (f"{low:.1f} to {high:.1f}", f"{one['deviation']:.0f}")
-            lines.append((*cells, *(p_value(one[key]) for key in ("p", "holm_p")), outcome))
+            tests = (p_value(one[key]) for key in ("p", "holm_p"))
+            lines.append((*cells, *tests, verdict_of(one)))
     head = ("test", "variant minus `frame`", "difference (95% interval)", "t-interval")
     return table((*head, "SD of pairs", "p", "Holm's p", "verdict"), lines)
+
+
+def verdict_of(one: dict) -> str:
+    """The verdict of a comparison; of an undecided one with the seeds that would decide."""
+    undecided = one["verdict"] == "undecided"
+    return one["verdict"] + (f" ({one['seeds_that_decide']} seeds)" if undecided else "")
 
 
 def p_value(p: float) -> str:
@@ -293,10 +295,9 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
 
 def drawable(claims: dict) -> set[str]:
     """The names of FIGURES whose data there are: those of study 5 wait for its parts."""
-    comparisons, waiting = claims["study5"]["comparisons"], {"study5", "study5_curves"}
-    if comparisons:
-        waiting = set() if "adding motion" in comparisons else {"study5_curves"}
-    return set(FIGURES) - waiting
+    comparisons = claims["study5"]["comparisons"]
+    ready = {"study5": bool(comparisons), "study5_curves": "adding motion" in comparisons}
+    return {name for name in FIGURES if ready.get(name, True)}
 
 
 def image(name: str, claims: dict) -> str:

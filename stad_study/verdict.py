@@ -52,10 +52,8 @@ def describe_interaction(one: dict) -> str:
 def describe_repetition(one: dict) -> str:
     """How far they are apart in part 5a of study 5, whose interaction this is."""
     low, high = one["interval"]
-    text = (
-        "[Study 5a](#is-it-the-motion), planned later, with three new controllers for each of the"
-    )
-    text += f" same V and M: {one['difference']:.1f} points"
+    text = "[Study 5a](#is-it-the-motion), planned later, with three new controllers for each of"
+    text += f" the same V and M: {one['difference']:.1f} points"
     return f"{text} ({low:.1f} to {high:.1f}; Holm's p = {one['holm_p']:.3f})."
 
 

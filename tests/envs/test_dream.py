@@ -131,6 +131,14 @@ def test_a_temperature_that_cannot_be_sampled_is_refused(temperature, agent):
         DreamEnv(agent.vae, agent.mdn_rnn, temperature)
 
 
+def test_a_refused_state_begins_no_dream(agent):
+    dream = DreamEnv(agent.vae, agent.mdn_rnn)
+    with pytest.raises(ValueError, match="expected M's memory"):
+        dream.reset(options={"state": 3})
+    with pytest.raises(RuntimeError, match="step before reset"):
+        dream.step(np.zeros(3, np.float32))
+
+
 def test_another_render_mode_is_refused(agent):
     with pytest.raises(ValueError, match="render_mode='human': choose one of None, rgb_array"):
         DreamEnv(agent.vae, agent.mdn_rnn, render_mode="human")
