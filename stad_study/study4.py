@@ -164,6 +164,8 @@ def add_run(run: Run, root: Path, to: Path) -> None:
     returns = {str(one["track"]): round(one["return"], 2) for one in score["episodes"]}
     line = key | describe_run(root / run.name, score)
     with locked(to, WAIT):
+        if recorded(run, to):
+            raise ValueError(f"{run.name} came into {to} from another folder: nothing was added")
         before = tables.read_or_empty(f"{NAME}_runs", to)
         others = before[before["variant"] == run.variant]["validation"]
         if others.empty or line["validation"] > others.max():

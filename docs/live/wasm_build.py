@@ -100,7 +100,7 @@ def entries() -> list:
 
     @cfunc(i8(p(f8), i8, p(f8), p(f8), p(i8)))
     def pave(path, count, tiles, kerbs, kerb_tiles):
-        found, beside, numbers, _ = pave_path(carray(path, (count, 4)))
+        found, beside, numbers = pave_path(carray(path, (count, 4)))
         carray(tiles, (count, 4, 2))[:] = found
         carray(kerbs, (len(beside), 4, 2))[:] = beside
         carray(kerb_tiles, (len(beside),))[:] = numbers

@@ -32,7 +32,6 @@ KERB_TILES = 4  # a kerb needs so many sharp turns in a row to the same side
 CHECKPOINTS = 12
 MAX_TILES = 2500  # the path is cut after so many steps, so no track has more tiles
 START_ANGLE = 2 * math.pi * (-0.5) / CHECKPOINTS  # radians, where a lap begins
-KERB_COLORS = np.array([[255, 255, 255], [255, 0, 0]], np.uint8)  # of even and of odd tiles
 
 
 class Track(NamedTuple):
@@ -47,9 +46,7 @@ class Track(NamedTuple):
     kerbs: np.ndarray
     """float64 (k, 4, 2): corners of the kerbs."""
     kerb_tiles: np.ndarray
-    """int64 (k,), increasing: the tile of each kerb. Gymnasium draws the kerb after it."""
-    kerb_colors: np.ndarray
-    """uint8 (k, 3): white beside even tiles, red beside odd ones."""
+    """int64 (k,), increasing: the tile of each kerb, which is drawn after it, white or red."""
 
 
 def make_track(random: np.random.Generator) -> Track:
@@ -204,7 +201,6 @@ def pave(path):
     tiles = np.empty((count, 4, 2))
     kerbs = np.empty((np.count_nonzero(border), 4, 2))
     kerb_tiles = np.empty(len(kerbs), np.int64)
-    kerb_colors = np.empty((len(kerbs), 3), np.uint8)
     kerb = 0
     for i in range(count):
         span(path, i, -TRACK_WIDTH, TRACK_WIDTH, tiles[i])
@@ -212,10 +208,8 @@ def pave(path):
             side = np.sign(path[i - 1, 1] - path[i, 1])
             span(path, i, side * TRACK_WIDTH, side * (TRACK_WIDTH + KERB_WIDTH), kerbs[kerb])
             kerb_tiles[kerb] = i
-            for channel in range(3):
-                kerb_colors[kerb, channel] = KERB_COLORS[i % 2, channel]
             kerb += 1
-    return tiles, kerbs, kerb_tiles, kerb_colors
+    return tiles, kerbs, kerb_tiles
 
 
 @compiled

@@ -78,6 +78,13 @@ def test_a_recorded_run_is_repeated_in_an_empty_folder_alone(made, tmp_path, cap
     assert f"mean return {mean:.1f}, recorded {mean:.1f}" in capsys.readouterr().out
 
 
+def test_a_run_that_came_from_another_folder_meanwhile_is_not_replaced(made):
+    before = tables.read("study4_runs", made / "data")
+    with pytest.raises(ValueError, match="from another folder: nothing was added"):
+        add_run(RUN, made / "study4", made / "data")
+    assert tables.read("study4_runs", made / "data").equals(before)
+
+
 def test_of_a_variant_the_agent_with_the_best_validation_is_kept(made, tmp_path):
     table = tables.read("study4_runs", made / "data")
     kept = tmp_path / "networks/study4/frame/controller.safetensors"
