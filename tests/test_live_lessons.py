@@ -237,7 +237,7 @@ def test_pictures_and_numbers_follow_the_kl_weight(opened):
     for network in networks:
         assert f"{network['kl']:.1f} nats" in page.inner_text("#summary")
         active = sum(kl > 0.05 for kl in network["kl_of_latents"])
-        assert f"in {active} of 32" in page.inner_text("#summary")
+        assert f" {active} of 32 latents" in page.inner_text("#summary")
         seen.add(page.locator(".strip canvas").nth(5).evaluate(pixels))  # the first reconstruction
         page.keyboard.press("ArrowRight")
     assert len(seen) == len(networks)

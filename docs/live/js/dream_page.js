@@ -102,12 +102,13 @@ stad.start(async () => {
       if (get(id).textContent !== text) get(id).textContent = text;
     };
     const [steering, gas, brake] = dream ? hand.action : drive.action(t);
-    const wheel = { agent: "C drives", hand: "you drive", recorded: "recorded actions" }[driver];
     const over = dream && from + dream.frames >= drive.length;
+    const names = { agent: "C drives", hand: "you drive", recorded: "recorded actions" };
+    const wheel = names[over && driver === "recorded" ? "agent" : driver]; // nothing else is recorded
     set("t", `${t}${over ? ", the recording has ended" : ""}`);
     set("dream-name", dream ? "The dream" : memory?.latents[t] ? "Reconstruction" : "Seen");
     const open = waiting ? "M is processing the episode up to this frame." : "The eyes are open.";
-    set("dream-note", dream ? `frame ${dream.frames}, ${wheel}` : open);
+    set("dream-note", dream ? `${(dream.frames / 50).toFixed(1)} s, ${wheel}` : open);
     set("eyes", dream ? "Open the eyes" : waiting ? "Keep them open" : "Close the eyes here");
     set("scrub-value", String(t));
     set(

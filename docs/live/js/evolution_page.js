@@ -49,8 +49,8 @@ stad.start(async () => {
     context.drawImage(background.picture, 0, 0, width, width);
     const path = track.paths[chosen];
     const points = path.map(place);
-    stad.strokeLine(context, points.slice(0, Math.ceil(moment) + 1), stad.COLORS.orange, 2.5);
-    stad.strokeLine(context, points, "rgba(230, 159, 0, 0.55)", 1.5);
+    stad.strokeLine(context, points.slice(0, Math.ceil(moment) + 1), stad.COLORS.green, 2.5);
+    stad.strokeLine(context, points, "rgba(0, 158, 115, 0.55)", 1.5);
     stad.fillDot(context, points[Math.min(points.length - 1, Math.floor(moment))], 5, "#c00000");
   }
 
@@ -183,12 +183,12 @@ stad.start(async () => {
   function stop() {
     clearInterval(timer);
     timer = 0;
-    stad.get("play").textContent = "Play";
+    stad.get("play").textContent = "Play generations";
   }
   const setDream = (on) => {
     if (on) clock.play();
     else clock.pause();
-    stad.get("dream-play").textContent = on ? "Pause the car and the dream" : "Go on";
+    stad.get("dream-play").textContent = on ? "Pause driving" : "Go on driving";
   };
 
   slider.max = last;
@@ -203,7 +203,7 @@ stad.start(async () => {
   });
   stad.get("play").addEventListener("click", () => {
     if (timer) return stop();
-    stad.get("play").textContent = "Pause";
+    stad.get("play").textContent = "Pause generations";
     setDream(!stad.prefersStill());
     if (chosen === last) choose(0);
     timer = setInterval(() => (chosen === last ? stop() : choose(chosen + 1)), 2500);

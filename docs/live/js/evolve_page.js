@@ -123,7 +123,7 @@ stad.start(async () => {
 
   function show() {
     const inputs = INPUTS[settings.sees];
-    view.show({ log, states, finished, bet, settings, inputs, workers: crew.workers.length });
+    view.show({ log, states, finished, bet, settings, inputs });
     showButtons();
   }
 

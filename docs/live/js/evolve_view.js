@@ -117,7 +117,7 @@ globalThis.stad ??= {};
     }
 
     showWords(rows) {
-      const { log, states, lap, bet, settings, workers } = this.shown;
+      const { log, states, lap, bet, settings } = this.shown;
       const [number, last, sigma] = [log.length, log.at(-1), states.at(-1).sigma.toFixed(3)];
       const total = (name, count) => log.slice(0, count).reduce((sum, one) => sum + one[name], 0);
       const points = (f) => f(rows.at(-1)).toFixed(0);
@@ -128,8 +128,8 @@ globalThis.stad ??= {};
         : "Nobody has driven yet.";
       get("summary").textContent = text;
       const time = (count) => `${total("seconds", count).toFixed(0)} seconds`;
-      get("driven").textContent =
-        `${total("frames").toLocaleString("en")} frames in ${time()}, on ${workers} workers.`;
+      const driven = `${total("frames").toLocaleString("en")} frames in ${time()}.`;
+      get("driven").textContent = number ? driven : "";
       get("answer").textContent = lap
         ? `${bet ? `You said ${bet}: the` : "The"} first whole lap came in generation ${lap}, after ${time(lap)}.`
         : "";

@@ -24,7 +24,7 @@ stad.start(async () => {
 
   function stopWave() {
     wave.pause();
-    get("wave").textContent = "Play";
+    get("wave").textContent = "Move the slider";
   }
 
   /** The latents, those with the largest KL first. */
@@ -89,8 +89,8 @@ stad.start(async () => {
       document.createElement(tag),
     );
     value.setAttribute("aria-live", "off"); // it changes while the first latent moves by itself
-    const meaning = Math.abs(r) >= 0.5 ? `, ${quantity} (r = ${r.toFixed(2)})` : "";
-    name.innerHTML = `<b>z[${i}]</b> ${kl(i).toFixed(2)} nats${meaning}`;
+    const meaning = Math.abs(r) >= 0.5 ? `<b>${quantity}</b> (r = ${r.toFixed(2)}): ` : "";
+    name.innerHTML = `${meaning}z[${i}], ${kl(i).toFixed(2)} nats`;
     Object.assign(range, { type: "range", min: -REACH, max: REACH, step: 0.05 });
     range.addEventListener("input", () => {
       stopWave();
@@ -243,7 +243,7 @@ stad.start(async () => {
   get("wave").addEventListener("click", () => {
     if (wave.running) return stopWave();
     wave.play();
-    get("wave").textContent = "Pause";
+    get("wave").textContent = "Stop the slider";
   });
   for (const [id, place] of [
     ["across", 0],

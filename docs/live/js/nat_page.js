@@ -106,17 +106,17 @@ stad.start(async () => {
       }),
     );
     const active = one.kl_of_latents.filter((value) => value > ACTIVE).length;
-    const bits = Math.round(one.kl / Math.LN2);
+    const bits = (one.kl / Math.LN2).toFixed(1);
     const text =
       `KL of z: ${one.kl.toFixed(1)} nats (${bits} bits) for a frame, ` +
-      `in ${active} of ${one.kl_of_latents.length} latents. Squared error: ${distortion(one).toFixed(0)}.`;
+      `${active} of ${one.kl_of_latents.length} latents active. Squared error: ${distortion(one).toFixed(0)}.`;
     stad.get("summary").textContent = text;
     stad.announce(`KL weight ${one.kl_weight}: ${text}`);
     curve.show({ lines: [{ points, color: stad.COLORS.blue }] });
     stad.describe(
       stad.get("curve"),
       `Rate against distortion. At KL weight ${one.kl_weight}: ${one.kl.toFixed(1)} nats and error ${distortion(one).toFixed(0)}. ` +
-        "The error falls steeply up to some 10 nats, and hardly beyond 50.",
+        "The error falls steeply up to some 10 nats, and not beyond 50.",
     );
     const [first] = sorted(one);
     stad.describe(

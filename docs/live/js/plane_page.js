@@ -116,7 +116,7 @@
     const begin = history[0].mean;
     drawCross(context, toPixels(begin, width), 8, "#222");
     const path = history.map(({ mean }) => toPixels(mean, width));
-    stad.strokeLine(context, path, stad.COLORS.orange, 2);
+    stad.strokeLine(context, path, stad.COLORS.green, 2);
     const order = sample.map((_, i) => i).sort((a, b) => fitness[a] - fitness[b]);
     const better = strategy.constants.better;
     order.forEach((i, rank) => {

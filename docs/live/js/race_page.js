@@ -384,7 +384,7 @@ stad.start(async () => {
 
   function showStart() {
     const title = `Beat the ${driver ? "evolved driver" : "agent"}`;
-    showCard(title, "You have 20 seconds.");
+    showCard(title, "It drives alone until you start. You have 20 seconds.");
   }
 
   function showEnd() {

@@ -54,7 +54,7 @@ stad.figure("breed", async (part) => {
     part("flag").setAttribute("aria-valuetext", `generation ${generations[i]}`);
     const points = planted ? `, ${facts.returns[i].toFixed(0)} points` : "";
     const lap = planted ? (facts.laps[i] ? ", a whole lap" : ", no whole lap") : "";
-    stad.describe(part("map"), `recorded drives of 25 of a hundred generations; generation ${generations[i]}${points}${lap}`); // prettier-ignore
+    stad.describe(part("map"), `recorded drives of the start and 24 generations; generation ${generations[i]}${points}${lap}`); // prettier-ignore
     if (planted) part("summary").textContent = `Generation ${generations[i]}${points}${lap}.`;
     draw();
   }

@@ -4,16 +4,16 @@ globalThis.stad ??= {};
 
 /** What this browser lacks for the engine, as a sentence; null if nothing. */
 stad.whatIsMissing = () => {
-  if (typeof WebAssembly !== "object") return "It needs WebAssembly, which this browser lacks.";
-  if (typeof Worker === "undefined") return "It needs workers, which this browser lacks.";
-  if (typeof DecompressionStream === "undefined") return "It needs a newer browser.";
+  if (typeof WebAssembly !== "object") return "It needs WebAssembly: please update your browser.";
+  if (typeof Worker === "undefined") return "It needs workers: please update your browser.";
+  if (typeof DecompressionStream === "undefined") return "It needs a newer browser: please update yours.";
   // A module with one SIMD instruction.
   const simd = [
     0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253,
     15, 253, 98, 11,
   ];
   if (!WebAssembly.validate(Uint8Array.from(simd)))
-    return "It needs WebAssembly SIMD, which this browser lacks.";
+    return "It needs WebAssembly SIMD: please update your browser.";
   return null;
 };
 
