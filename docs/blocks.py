@@ -33,6 +33,7 @@ from stad_study.figures import (
     plot_scores,
     plot_study,
 )
+from stad_study.study import STUDIES
 from stad_study.study_claims import FAMILIES, FEATURES, MARGIN
 from stad_study.verdict import (
     PAPER_GAIN,
@@ -97,8 +98,7 @@ def gains(claims: dict) -> str:
     study, told = claims["study1"], []
     for features in SEEN:
         one = study["comparisons"][f"{features}: input_output"]
-        points = f"{one['difference'] + 0.0:.0f} points".replace("-0 ", "0 ")
-        told.append(f"{name_verdict(one)} ({points})")
+        told.append(f"{name_verdict(one)} ({round(one['difference'])} points)")
     both, alone = told
     if out_of_reach(study, "z, h"):
         both += "; the paper's gain was out of reach"
@@ -322,7 +322,7 @@ def experiments_table(claims: dict) -> str:
 # The latents
 
 
-def r2(claims: dict, driver: str, world_model: str, features: str = "z") -> dict[str, float]:
+def r2(claims: dict, driver: str, world_model: str, features: str) -> dict[str, float]:
     """R2 of the probe: quantity -> value."""
     return claims["probe"][f"{driver}: {world_model}"][features]
 
@@ -488,15 +488,16 @@ def faster_recipe(claims: dict) -> str:
     """What study 6 says of the preset `fast`."""
     found = claims["study6"]
     outcome = "does not" if found["not_worse"] else "may"
+    pairs, seeds = len(found["scores"]["study6_fast"]), len(STUDIES["study6_fast"].seeds)
     return (
         f"A run took {found['minutes']['study6_fast']:.0f} minutes with `fast` and"
         f" {found['minutes']['study6_laptop']:.0f} with `laptop` (medians; V and M trained on one"
         " core)."
         f" [Study 6](protocol.md#study-6-a-faster-recipe): `fast` {outcome} lose {MARGIN} "
-        f"points or more against `laptop`. Over twelve pairs the mean difference is "
+        f"points or more against `laptop`. Over {pairs} pairs the mean difference is "
         f"{found['difference']:+.1f} points, with a standard deviation of "
         f"{found['deviation']:.0f}, and its one-sided 95% bound {found['lower_bound']:+.1f}; from "
-        f"the means of six seeds the bound is {found['lower_bound_of_seeds']:+.1f}. V was of "
+        f"the means of {seeds} seeds the bound is {found['lower_bound_of_seeds']:+.1f}. V was of "
         "`frame` or `input_output`, and C saw z and h."
     )
 

@@ -40,9 +40,9 @@ def check(submission: tyro.conf.Positional[str], limits: Limits = Limits()) -> i
         submission: A Python file with make_agent(), a folder with such an agent.py, or a run.
         limits: What a submission may use.
     """
-    from stad_course.compete import run
+    from stad_course.compete.drive import check_submission
 
-    said = run.check_submission(given(submission, "the submission"), limits)
+    said = check_submission(given(submission, "the submission"), limits)
     print(said)
     return int(said.startswith("FAILED"))
 
@@ -56,9 +56,9 @@ def commit(secret: tyro.conf.Positional[str], tracks: int | None = None) -> None
         secret: The file of hidden tracks, ending in .json.
         tracks: How many to draw; 50 if not given.
     """
-    from stad_course.compete import run
+    from stad_course.compete.tracks import hide_tracks
 
-    print(run.hide_tracks(given(secret, "the file of hidden tracks"), tracks))
+    print(hide_tracks(given(secret, "the file of hidden tracks"), tracks))
 
 
 def compete(

@@ -56,7 +56,7 @@ def drive(
     Raises:
         ValueError: not as many tracks as controllers, or none.
     """
-    if len(controllers) != len(tracks):
+    if not 0 < len(controllers) == len(tracks):
         raise ValueError(f"{len(controllers)} controllers on {len(tracks)} tracks: expected pairs")
     groups = np.array_split(np.arange(len(tracks)), min(THREADS, len(tracks)))
     limits = max_frames, patience
@@ -114,6 +114,8 @@ def watch(agent: Agent, track: int) -> Watched:
 
 def sharpest_bends(tracks: Iterable[int]) -> tuple[np.ndarray, np.ndarray]:
     """The sharpest bend of each track over BEND tiles, to the left and to the right.
+
+    A bend across the start line is not seen.
 
     Returns:
         How far it turns, degrees, float64 (tracks, 2), and the tile where it begins, int64

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import gymnasium as gym
 import numpy as np
 
-from stad_lab.envs.arguments import car_numbers, numbers, shown, whole_number
+from stad_lab.envs.arguments import car_numbers, finite_array, numbers, shown, whole_number
 from stad_lab.envs.car_racing import MAX_FRAMES, make_env
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import FRAME_SIZE, FrameMemory, to_frame
@@ -87,7 +87,7 @@ class Agent:
         self.hidden = self.state[0]
         actions = control(self.present_parameters(), self.features())
         if self.remembers:
-            self.remember(actions, self.state)
+            self.state = self.inference.remember(self.latents, actions, self.state)
         return actions
 
     def features(self) -> np.ndarray:
@@ -95,7 +95,7 @@ class Agent:
         return np.concatenate([self.latents, self.hidden], axis=1)
 
     def remember(self, actions: np.ndarray, before: np.ndarray | None) -> None:
-        """Update M's memory with the last z and these actions, float32 (cars, 3).
+        """Update M's memory with the last z and these finite actions, float32 (cars, 3).
 
         `act` does it with its own actions. A driver that changes them calls this again.
 
@@ -103,8 +103,8 @@ class Agent:
             before: `state` as it was before that `act`; None before an episode's first.
         """
         self._check_acted()
-        if before is None:
-            before = self._zero_state(len(self.latents))
+        actions = finite_array("actions", actions, (len(self.latents), 3), "one row for each car")
+        before = self._zero_state(len(self.latents)) if before is None else before
         self.state = self.inference.remember(self.latents, actions, before)
 
     def present_parameters(self) -> np.ndarray:

@@ -61,7 +61,7 @@ def result_file(file: Path | None, source: str, kind: str, details: str = "") ->
     run = run_folder(source)
     name = f"{kind}-{run.resolve().name}{details}.json"
     file = file or (Path(name) if run.parent == PRETRAINED else run / name)
-    check_output(file)
+    check_output(file, kind)
     return file
 
 

@@ -101,7 +101,7 @@ def evaluate(
     found: dict[str, dict] = {}
     tracks = range(first_track, first_track + episodes)
     if json:
-        check_output(json)
+        check_output(json, "study")
         found = read_driven(json, study, tracks)
     with cluster_of(scheduler) as executor:
         agents = evaluate_kept(study, tracks, seeds, only, executor=executor, driven=list(found))
@@ -197,7 +197,7 @@ def benchmark(
     from stad_study.benchmark import PARTS, benchmark
     from stad_study.tables import add_speed
 
-    check_output(json)
+    check_output(json, "benchmark")
     benchmark(list(parts) or list(PARTS), rounds, json)
     print(f"\nevery measurement: {json}")
     if add:

@@ -40,7 +40,7 @@ from stad_study.study import (
     claimed,
     fixed_threads,
     groups_of,
-    refuse_finished,
+    refuse_repeated,
     select,
 )
 
@@ -124,9 +124,8 @@ def run_evolved(
     recorded run that `only` names.
     """
     root = Path(folder) / study.name
-    for run in find_runs(study, seeds, only, to) if only else ():
-        if recorded(study, run, to):
-            refuse_finished(root / run.name)
+    asked = find_runs(study, seeds, only, to) if only else []
+    refuse_repeated(root, [run for run in asked if recorded(study, run, to)])
     tried: set[str] = set()
     # What is found may grow with the tables: a gate decides what follows it.
     while runs := [run for run in find_runs(study, seeds, only, to) if run.name not in tried]:

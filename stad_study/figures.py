@@ -195,7 +195,13 @@ def plot_drivers(study3: dict) -> Figure:
         for driver, name in DRIVERS.items()
         for quantity in TURNING
     }
-    return plot_probe(panels, f"Study 3: the motion that {study3['networks']} V networks carry")
+    title = f"Study 3: the motion that {study3['networks']} V networks carry"
+    figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
+    told = []
+    for panel, rows in panels.items():
+        means = [f"{row} {round(one['from z'][0], 2) + 0.0:.2f}" for row, one in rows.items()]
+        told.append(f"{panel}: {', '.join(means)}")
+    return describe(figure, title, "Mean R2 from z. ", ["; ".join(told)])
 
 
 def representation(study3: dict, driver: str) -> dict[str, dict]:
@@ -212,17 +218,6 @@ def representation(study3: dict, driver: str) -> dict[str, dict]:
         }
         for quantity in next(iter(rows.values()))["z"]
     }
-
-
-def plot_probe(panels: dict[str, dict], title: str) -> Figure:
-    """Panels of R2, whose alternative text has the means from z of what a frame does not show."""
-    figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
-    told = []
-    for panel, rows in panels.items():
-        if panel.startswith(TURNING):
-            means = [f"{row} {round(one['from z'][0], 2) + 0.0:.2f}" for row, one in rows.items()]
-            told.append(f"{panel}: {', '.join(means)}")
-    return describe(figure, title, "Mean R2 from z. ", ["; ".join(told)])
 
 
 def plot_primary(comparisons: dict[str, dict], margin: float) -> Figure:

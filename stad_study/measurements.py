@@ -34,11 +34,15 @@ def describe_models(metrics: pandas.DataFrame) -> dict:
 
 
 def describe_speed(speed: pandas.DataFrame) -> dict:
-    """Median over the rounds, and ratio to the reference, by "PART: MEASURE" and condition."""
+    """By "PART: MEASURE" and condition "median" over the rounds and "ratio" to the reference.
+
+    Where a measure has no reference, the median alone.
+    """
     found = {}
     for (part, measure), own in speed.groupby(["part", "measure"]):
         medians = own.groupby("condition")["value"].median().to_dict()
-        for unit in [medians[name] for name in REFERENCES if name in medians][:1]:
+        unit = next((medians[name] for name in REFERENCES if name in medians), None)
+        if unit:
             medians = {name: {"median": m, "ratio": m / unit} for name, m in medians.items()}
         found[f"{part}: {measure}"] = medians
     return found

@@ -141,7 +141,7 @@ def train_world_model(
 
 
 def share_world_model(config: Config, run: Path, world: Path) -> None:
-    """Copy V and M into a run, with the components and first C of a seed that has this V and M."""
+    """Copy V and M (V alone if M is not trained), and components and first C of a like seed."""
     run.mkdir(parents=True, exist_ok=True)
     trained = (VAE_FILE, MDN_RNN_FILE) if config.mdn_rnn.steps else (VAE_FILE,)
     for other in [world, *run.parent.glob("seed*")]:

@@ -20,7 +20,7 @@ def ship(folder: str | Path, name: str) -> Path:
     """
     folder, target = Path(folder), PRETRAINED / name
     if target.resolve() == folder.resolve() or not name.isidentifier():
-        expected = "a new name of letters, digits and _, and another folder"
+        expected = "a name of letters, digits and _, and the folder of a run"
         raise ValueError(f"name={name!r}, folder={folder}: expected {expected}")
     copy_in_half(folder, target)
     return target

@@ -169,9 +169,7 @@ def run_study(
     names; and what `train` raises.
     """
     wanted, root = find_pipelines(study, seeds, only), Path(folder) / study
-    for pipeline in wanted if only else ():
-        if recorded(pipeline, to):
-            refuse_finished(root / pipeline.name)
+    refuse_repeated(root, [one for one in wanted if only and recorded(one, to)])
     for seed, variant in dict.fromkeys((one.seed, one.variant) for one in wanted):
         own = [one for one in wanted if (one.seed, one.variant) == (seed, variant)]
         if not only and not unfinished(own, to):
@@ -205,11 +203,12 @@ def claimed(folder: Path) -> Iterator[bool]:
         yield ours
 
 
-def refuse_finished(folder: Path) -> None:
-    """ValueError if a run that is to be repeated is finished in this folder."""
-    if (folder / SCORE).exists():
-        remedy = "give an empty folder with --out to repeat it"
-        raise ValueError(f"{folder} has the recorded run: {remedy}")
+def refuse_repeated(root: Path, runs: Sequence[Run]) -> None:
+    """ValueError if one of these runs, which are to be repeated, is finished in its folder."""
+    for folder in (root / run.name for run in runs):
+        if (folder / SCORE).exists():
+            remedy = "give an empty folder with --out to repeat it"
+            raise ValueError(f"{folder} has the recorded run: {remedy}")
 
 
 def unfinished(pipelines: list[Pipeline], to: Path) -> list[Pipeline]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from stad_study import tables
 from stad_study.evolved import describe_counts
+from stad_study.study import STUDIES
 from stad_study.study2 import GATE, SEEDS, STUDY2, has_passed
 from stad_study.study_claims import compare_arms
 
@@ -53,6 +54,5 @@ def gate_scores(episodes: int, folder: Path) -> list[float]:
 
 def returns_of(variant: str, episodes: int, folder: Path) -> np.ndarray:
     """Returns (seeds, tracks) of the runs of a variant."""
-    table = tables.read("study2_returns", folder).set_index(tables.BUDGET)
-    table = table[[column for column in table if column.isdigit()]]
+    table = tables.returns_of_runs("study2", STUDIES["study1"].tracks, folder)
     return np.array([table.loc[(seed, variant, episodes)] for seed in SEEDS])

@@ -42,7 +42,7 @@ from stad_study.study import (
     claimed,
     drive_tracks,
     fixed_threads,
-    refuse_finished,
+    refuse_repeated,
     select,
 )
 
@@ -94,9 +94,7 @@ def run_study4(
     as `find_runs`, and for a folder with a recorded run that `only` names.
     """
     root, wanted = Path(folder) / NAME, find_runs(seeds, only)
-    for run in wanted if only else ():
-        if recorded(run, to):
-            refuse_finished(root / run.name)
+    refuse_repeated(root, [run for run in wanted if only and recorded(run, to)])
     for run in wanted:
         with claimed(root / run.name) as ours:
             was = recorded(run, to)

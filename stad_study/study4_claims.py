@@ -23,11 +23,7 @@ def describe_study4(folder: Path = tables.DATA) -> dict:
     found: dict = {"runs": len(runs), "planned": len(find_runs())}
     if found["runs"] < found["planned"]:
         return found
-    returns = tables.read_or_empty("study4_returns", folder).set_index(tables.AGENT)
-    returns = returns.reindex(index=runs.index, columns=[str(track) for track in TRACKS])
-    if returns.isna().any(axis=None):
-        where = f"the tracks {TRACKS[0]} to {TRACKS[-1]}"
-        raise ValueError(f"study4_returns: expected a return of each run on {where}")
+    returns = tables.returns_of_runs("study4", TRACKS, folder)
     found["agents"] = {}
     for variant, own in runs.groupby(level="variant", sort=False):
         chosen = own["validation"].idxmax()

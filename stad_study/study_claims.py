@@ -32,7 +32,7 @@ def describe_study1(folder: Path = tables.DATA) -> dict:
     if found["complete_seeds"] < found["planned_seeds"]:
         return found
     returns = returns_of_study("study1", folder)
-    curves = learning_curves("study1", folder)
+    curves = learning_curves(folder)
     areas = {arm: area_under(*curve) for arm, curve in curves.items()}
     comparisons: dict[str, dict] = {}
     for variants in FAMILIES.values():
@@ -205,20 +205,20 @@ def describe_arm(returns: np.ndarray, areas: np.ndarray) -> dict:
     }
 
 
-def learning_curves(study: str, folder: Path = tables.DATA) -> dict[str, tuple]:
-    """Arm -> episodes driven so far, and the validation mean there: arrays (seeds, validations).
+def learning_curves(folder: Path = tables.DATA) -> dict[str, tuple]:
+    """Arm of study 1 -> episodes driven so far, validation mean there: (seeds, validations) each.
 
     Episodes count all that a pipeline drives: dataset, candidates and validations.
     """
-    table, planned = tables.read_study("generations", folder), STUDIES[study]
-    table = table[(table["study"] == study) & table["validation"].notna()]
+    table, planned = tables.read_study("generations", folder), STUDIES["study1"]
+    table = table[(table["study"] == "study1") & table["validation"].notna()]
     wide = table.pivot(
         index=["features", "variant", "seed"],
         columns="generation",
         values=["episodes", "validation"],
     )
     if wide.isna().any(axis=None):
-        raise ValueError(f"{study}: expected validations of every pipeline in the same generations")
+        raise ValueError("study1: expected validations of every pipeline in the same generations")
     return {
         f"{features}: {variant}": tuple(
             wide[part].loc[features, variant].to_numpy(np.float64)

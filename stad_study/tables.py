@@ -94,6 +94,21 @@ def line_of(name: str, key: Sequence, folder: Path = DATA) -> dict | None:
     return own.iloc[0].to_dict() if len(own) else None
 
 
+def returns_of_runs(study: str, tracks: Sequence[int], folder: Path = DATA) -> pandas.DataFrame:
+    """The returns of study 2 or 4: a line for each of its runs, a column for each track.
+
+    ValueError if a run has no return on one of the tracks.
+    """
+    keys = TABLES[f"{study}_runs"][0]
+    runs, table = (read_or_empty(f"{study}_{part}", folder) for part in ("runs", "returns"))
+    wanted = {"index": runs.set_index(keys).index, "columns": [str(track) for track in tracks]}
+    table = table.set_index(keys).reindex(**wanted)
+    if table.isna().any(axis=None):
+        where = f"the tracks {tracks[0]} to {tracks[-1]}"
+        raise ValueError(f"{study}_returns: expected a return of each run on {where}")
+    return table
+
+
 def episodes(folder: Path = DATA) -> pandas.DataFrame:
     """The evaluation of each run: `return` and `frames` on every test track."""
     table = read("episodes", folder)

@@ -105,7 +105,7 @@ def describe_paper_gain(study: dict) -> str:
 
 
 def describe_cause(study: dict) -> list[str]:
-    """What the comparisons of study 5 mean, one sentence for each part that is complete.
+    """What the comparisons of study 5 mean: of 5a, and of 5b and 5c, where they are complete.
 
     Args:
         study: what `describe_study5` returns.

@@ -104,6 +104,25 @@ def test_an_agent_that_has_not_acted_says_so():
         agent.remember(np.zeros((3, 3), np.float32), None)
 
 
+@pytest.mark.parametrize("actions", [np.zeros((1, 2)), np.zeros((2, 3)), np.full((1, 3), np.nan)])
+def test_m_remembers_no_actions_of_another_shape_or_that_are_not_finite(observations, actions):
+    agent = make_agent()
+    agent.act(observations[0])
+    with pytest.raises(ValueError, match="one row for each car"):
+        agent.remember(actions.astype(np.float32), None)
+
+
+def test_m_remembers_actions_of_another_dtype(observations):
+    agent = make_agent()
+    states = []
+    for dtype in (np.float32, np.float64):
+        agent.act(observations[0])
+        agent.remember(np.full((1, 3), 0.5, dtype), None)
+        states.append(agent.state)
+        agent.reset()
+    assert np.array_equal(*states)
+
+
 def test_reset_forgets_the_past(observations):
     agent = make_agent()
     first = act_along(agent, observations[:8])
@@ -414,8 +433,8 @@ def test_a_damaged_run_is_not_shipped_and_one_without_c_leaves_none_of_before(
     (run / "controller.safetensors").write_bytes(b"cut short")
     for folder, name, message in (
         (run, "mine", r"controller\.safetensors is damaged"),
-        (target, "mine", "expected a new name of letters"),
-        (quick_run, "../mine", "expected a new name of letters"),
+        (target, "mine", "expected a name of letters"),
+        (quick_run, "../mine", "expected a name of letters"),
     ):
         with pytest.raises(ValueError, match=message):
             ship(folder, name)

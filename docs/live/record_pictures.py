@@ -9,6 +9,7 @@ from pathlib import Path
 
 from PIL import Image
 from playwright.sync_api import sync_playwright
+from record_tab import launch
 
 PICTURES = Path(__file__).parent / "pictures"
 SHOWN = {  # page -> what of it is shown
@@ -28,9 +29,7 @@ def record(site: Path) -> None:
     """Write one WebP picture for each page."""
     PICTURES.mkdir(exist_ok=True)
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path="/usr/bin/chromium", args=["--no-sandbox"]
-        )
+        browser = launch(playwright)
         page = browser.new_page(viewport={"width": 900, "height": 800})
         for name, part in SHOWN.items():
             page.goto((site.resolve() / "docs" / "live" / f"{name}.html").as_uri())
@@ -51,4 +50,6 @@ def record(site: Path) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        raise SystemExit("usage: python docs/live/record_pictures.py SITE")
     record(Path(sys.argv[1]))

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 import live_build
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser, Playwright, sync_playwright
 
 from stad_lab.training.record import processor
 
@@ -42,6 +42,12 @@ MEASURE = """async ([name, track, seconds]) => {
 }"""
 
 
+def launch(playwright: Playwright) -> Browser:
+    """The Chromium of this machine."""
+    path = shutil.which("chromium") or shutil.which("google-chrome")
+    return playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+
+
 def measure(folder: Path) -> dict[str, list[float]]:
     """Driver -> frames a second of each round, in a page in this folder."""
     live_build.write_scripts(folder)
@@ -49,8 +55,7 @@ def measure(folder: Path) -> dict[str, list[float]]:
     (folder / "index.html").write_text(f"<!doctype html><title>speed</title>{tags}", "utf-8")
     speeds: dict[str, list[float]] = {}
     with sync_playwright() as playwright:
-        path = shutil.which("chromium") or shutil.which("google-chrome")
-        chromium = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        chromium = launch(playwright)
         page = chromium.new_page()
         page.goto((folder / "index.html").as_uri())
         for _ in range(ROUNDS):

@@ -12,7 +12,13 @@ from typing import Any
 import numpy as np
 
 from stad_course.compete.limits import Limits
-from stad_course.compete.process import Failure, Submission, files_of
+from stad_course.compete.process import (
+    LARGEST_SUBMISSION,
+    Failure,
+    Submission,
+    files_of,
+    size_of,
+)
 from stad_lab.agent import PRETRAINED, rollout
 from stad_lab.envs.cars import Cars
 from stad_lab.io.files import checksum, checksum_of_json, load_json, save_json
@@ -70,8 +76,8 @@ def compete(
         (name, path, tracks, folder / f"{name}.json", limits, hidden)
         for name, path in entries.items()
     ]
-    for _, _, _, file, *_ in tasks:
-        check_conditions(file, tracks, limits)
+    for name in entries:
+        check_conditions(folder / f"{name}.json", tracks, limits)
     results = {}
     with worker_threads(processes) as executor:
         for number, result in run_tasks(executor, drive_submission, tasks, patience=86_400.0):
@@ -184,12 +190,15 @@ def replay(track: int, actions: list[list], every: int) -> list[np.ndarray]:
 
 
 def fingerprint(path: Path) -> str:
-    """A checksum of a submission's files."""
+    """A checksum of a submission's files, or their size if that is too large to read them."""
+    if (size := size_of(path)) > LARGEST_SUBMISSION:
+        return f"{size} bytes"
     if path.is_file():
         return checksum(path.read_bytes())
     files = sorted(file for file in files_of(path) if "__pycache__" not in file.parts)
+    read = {one: bytes(one.readlink()) if one.is_symlink() else one.read_bytes() for one in files}
     return checksum_of_json(
-        [[str(one.relative_to(path)), checksum(one.read_bytes())] for one in files]
+        [[str(one.relative_to(path)), checksum(content)] for one, content in read.items()]
     )
 
 

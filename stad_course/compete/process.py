@@ -205,7 +205,8 @@ class Submission:
             self.process.wait(2)
         status = self.process.returncode
         if status is not None and status < 0:
-            return f"its process was ended by {signal.Signals(-status).name}"
+            named = {number.value: number.name for number in signal.Signals}  # real-time ones lack
+            return f"its process was ended by {named.get(-status, f'signal {-status}')}"
         return f"its process ended by itself (exit status {status})"
 
     def _watch(self) -> None:
@@ -251,8 +252,7 @@ class Submission:
 def copied(path: Path, folder: Path) -> Path:
     """A copy of a submission in a folder, without a run's dataset. Failure if it is too large."""
     target = folder / path.resolve().name
-    size = sum(one.lstat().st_size for one in files_of(path))
-    if size > LARGEST_SUBMISSION:
+    if (size := size_of(path)) > LARGEST_SUBMISSION:
         raise Failure(
             f"it has {size / 1e6:.0f} MB, at most {LARGEST_SUBMISSION / 1e6:.0f} are read"
         )
@@ -263,6 +263,11 @@ def copied(path: Path, folder: Path) -> Path:
         return [DATASET] if is_run(path) and Path(parent) == path else []
 
     return Path(shutil.copytree(path, target, symlinks=True, ignore=left_out))
+
+
+def size_of(path: Path) -> int:
+    """The size of a submission's files, bytes; a link within a folder is not followed."""
+    return sum((one.stat() if one == path else one.lstat()).st_size for one in files_of(path))
 
 
 def is_run(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""The command `compete`: from a folder of submissions to a leaderboard."""
+"""From a folder of submissions to a leaderboard, and the kit of a first agent."""
 
 import shlex
 import shutil
@@ -9,7 +9,6 @@ from stad_course.compete.drive import (
     BASELINE,
     BASELINES,
     STARTER,
-    check_submission,
     compete,
     find_submissions,
 )
@@ -17,10 +16,8 @@ from stad_course.compete.limits import Limits
 from stad_course.compete.page import leaderboard
 from stad_course.compete.process import PACKAGE, can_isolate
 from stad_course.compete.ranking import rank
-from stad_course.compete.tracks import hide_tracks, load_tracks
+from stad_course.compete.tracks import load_tracks
 from stad_lab.io.files import locked, write_bytes
-
-__all__ = ["check_submission", "hide_tracks", "run", "write_kit"]
 
 
 def run(
@@ -56,7 +53,7 @@ def run(
 
 def check_hidden(folder: Path) -> None:
     """Raise ValueError for a folder that no submission can do without."""
-    for needed in (PACKAGE, Path(sys.prefix).resolve()):
+    for needed in (PACKAGE, *(Path(one).resolve() for one in (sys.prefix, sys.base_prefix))):
         if needed.is_relative_to(folder.resolve()):
             reason = f"holds {needed}, which submissions need, and is hidden from them"
             raise ValueError(f"{folder} {reason}: choose another folder")

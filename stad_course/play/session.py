@@ -138,7 +138,7 @@ class Session:
 
     def path(self) -> np.ndarray:
         """Where the real car was in each frame so far, world units, float64 (T, 2)."""
-        return np.array(self.poses)[:, :2]
+        return np.array(self.poses).reshape(-1, 3)[:, :2]
 
     def give(self, driver: str) -> None:
         """Let "hand" or "agent" drive (ValueError for others), from the last action on."""

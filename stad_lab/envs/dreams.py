@@ -18,10 +18,10 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
-from stad_lab.envs.arguments import check_options, numbers, shown, whole_number
+from stad_lab.envs.arguments import check_options, numbers, whole_number
 from stad_lab.envs.cars import MOST_CARS, seeds_of
 from stad_lab.envs.dream import DreamEnv
-from stad_lab.envs.vector import check_autoreset
+from stad_lab.envs.vector import check_autoreset, check_mask
 from stad_lab.models.mdn_rnn import MDNRNN, Mixture
 from stad_lab.models.vae import VAE, to_uint8
 
@@ -74,11 +74,7 @@ class DreamVector(gym.vector.VectorEnv):
                 all dreams; ValueError for another mask.
         """
         self._check_open()
-        mask = np.asarray(check_options(options).get("reset_mask", np.ones(self.num_envs, bool)))
-        if mask.dtype != bool or mask.shape != (self.num_envs,) or not (self._begun or mask.all()):
-            raise ValueError(
-                f"reset_mask={shown(mask)}: expected bool ({self.num_envs},), at first all"
-            )
+        mask = check_mask(check_options(options), self.num_envs, self._begun)
         seeds = seeds_of(seed, self.num_envs)
         for number in np.flatnonzero(mask).tolist():
             self.dreams[number].reset(seed=seeds[number])
@@ -92,18 +88,18 @@ class DreamVector(gym.vector.VectorEnv):
         """Dream one frame; actions are float32 (num_envs, 3). Rewards are 0, as in `DreamEnv`.
 
         Raises:
-            ValueError: actions of another shape, or not finite.
+            ValueError: actions of another shape, or not finite where a dream goes on.
             ResetNeeded: before the first reset.
             RuntimeError: a dream that has ended must be reset first (DISABLED).
         """
         self._check_begun()
         actions = numbers("actions", actions, "one action for each dream").astype(np.float32)
-        if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
-            raise ValueError(
-                f"actions of shape {actions.shape}: expected finite numbers of shape"
-                f" {self.action_space.shape}"
-            )
         begin, going_on = np.flatnonzero(self._ended), np.flatnonzero(~self._ended)
+        shape = self.action_space.shape
+        if actions.shape != shape or not np.isfinite(actions[going_on]).all():
+            raise ValueError(
+                f"actions of shape {actions.shape}: expected finite numbers of shape {shape}"
+            )
         if len(begin) and self.autoreset_mode == AutoresetMode.DISABLED:
             raise RuntimeError(f"dreams {begin.tolist()} have ended: call reset")
         self._predict(going_on, actions[going_on])
@@ -122,6 +118,12 @@ class DreamVector(gym.vector.VectorEnv):
             return None
         self._check_begun()
         return tuple(to_uint8(self.vae.decode(torch.from_numpy(self._observations()))[0]))
+
+    @property
+    def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
+        """The last seed of each dream."""
+        self._check_open()
+        return tuple(dream.np_random_seed for dream in self.dreams)
 
     def _predict(self, numbers: np.ndarray, actions: np.ndarray) -> None:
         """M predicts for some dreams together; each samples with its own random numbers."""

@@ -21,9 +21,8 @@ them all would be slow, so there are copies of the texture at 1/4, 1/8 and 1/16 
 colour (*mip levels*), and a picture uses the copy with about two texels per pixel.
 
 `draw_picture` makes the observation, uint8 (96, 96, 3), or the agent's frame, uint8 (64, 64, 3),
-straight from the texture. Everything is compiled by Numba and releases the GIL; nothing
-here knows Box2D. Images are indexed [row, column]; the texture's rows follow the world's y axis
-upward, its columns the x axis.
+straight from the texture. All drawing is compiled by Numba and releases the GIL. Images are
+indexed [row, column]; the texture's rows follow the world's y axis upward, its columns the x axis.
 
 To keep compilation short, the code avoids what makes Numba compile a function twice (integer
 literals as arguments, arrays of different layouts) and array expressions where a loop does.
@@ -181,13 +180,6 @@ def ground_colors(background: np.ndarray, grass: np.ndarray, road: np.ndarray) -
     shades = [np.asarray(road) + 0.01 * shade * 255 for shade in range(ROAD_SHADES)]
     colors = [background, grass, *shades, (255, 255, 255), (255, 0, 0), (0, 0, 0)]
     return np.array([[max(0, int(c) - DARKENING) for c in color] for color in colors], np.uint8)
-
-
-def texture(ground: Ground, car: int) -> np.ndarray:
-    """The painted ground of a car in colour, north up, uint8 (SIZE, SIZE, 3): to look at."""
-    lanes = ground.palette[car][ground.texels[car, ::-1]]
-    channels = [(lanes >> np.uint64(shift)) & np.uint64(0xFF) for shift in (0, 16, 32)]
-    return np.stack(channels, axis=-1).astype(np.uint8)
 
 
 # Painting

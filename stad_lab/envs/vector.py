@@ -33,6 +33,16 @@ def check_autoreset(mode: AutoresetMode | str) -> AutoresetMode:
     return names[choice("autoreset_mode", mode, names)]
 
 
+def check_mask(options: dict, count: int, begun: bool) -> np.ndarray:
+    """The "reset_mask" of a reset, bool (count,); all without one. ValueError for another mask."""
+    mask = np.asarray(options.get("reset_mask", np.ones(count, bool)))
+    if mask.dtype != bool or mask.shape != (count,) or not mask.any():
+        raise ValueError(f"reset_mask={shown(mask)}: expected bool ({count},), one at least")
+    if not begun and not mask.all():
+        raise ValueError(f"reset_mask={shown(mask)}: the first reset is of all, leave it out")
+    return mask
+
+
 class CarRacingVector(gym.vector.VectorEnv):
     """`num_envs` cars, each with its own track.
 
@@ -102,15 +112,7 @@ class CarRacingVector(gym.vector.VectorEnv):
         """
         self._check_open()
         options = check_options(options)
-        mask = np.asarray(options.get("reset_mask", np.ones(self.num_envs, bool)))
-        if mask.dtype != bool or mask.shape != (self.num_envs,) or not mask.any():
-            raise ValueError(
-                f"reset_mask={shown(mask)}: expected bool ({self.num_envs},), one at least"
-            )
-        if not self._begun and not mask.all():
-            raise ValueError(
-                f"reset_mask={shown(mask)}: the first reset is of all cars, leave it out"
-            )
+        mask = check_mask(options, self.num_envs, self._begun)
         whole = seeds_of(seed, self.num_envs)
         which = np.flatnonzero(mask)
         seeds = [one for one, asked in zip(whole, mask, strict=True) if asked]

@@ -72,6 +72,9 @@ def evaluate(
     # Of V and M as they are loaded: a shipped agent's may be of lower precision.
     weights = {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
     asked = {**identity, "tracks": tracks, **weights}
+    command = f"python -m stad_lab evaluate --agent {shlex.quote(str(source))}"
+    command += f" --episodes {episodes} --first-track {first_track}{' --fast' * fast}"
+    made_with = provenance(command)  # before the work: it fails where a package is half installed
     driven, seconds = read_unfinished(unfinished, asked)
     begin = time.perf_counter() - seconds
     missing = [track for track in tracks if str(track) not in driven]
@@ -89,9 +92,6 @@ def evaluate(
     returns, lengths = zip(*(driven[str(track)] for track in tracks), strict=True)
     result = report(tracks, np.array(returns), np.array(lengths))
     seconds = time.perf_counter() - begin
-    command = f"python -m stad_lab evaluate --agent {shlex.quote(str(source))}"
-    command += f" --episodes {episodes} --first-track {first_track}{' --fast' * fast}"
-    made_with = provenance(command)
     return {"kind": KIND, **identity, **result, "seconds": seconds, "made_with": made_with}
 
 
@@ -142,18 +142,21 @@ def report(tracks: list[int], returns: np.ndarray, lengths: np.ndarray) -> dict:
     return {**summarise(returns), "episodes": episodes}
 
 
-def check_output(path: Path) -> None:
-    """Raise ValueError if a result would overwrite anything but a result, OSError if unwritable."""
+def check_output(path: Path, kind: str) -> None:
+    """Raise ValueError if a result would overwrite anything but one of its kind.
+
+    OSError if the file cannot be written.
+    """
     check_writable(path)
     if path.name in RUN_FILES:
         raise ValueError(f"{path} is the name of a run's own file: choose another name")
     if path.exists():
         try:
-            kind = load_json(path).get("kind")
+            found = load_json(path).get("kind")
         except ValueError:
-            kind = "damaged"
-        if kind not in (KIND, "probe", "benchmark", "study"):
-            raise ValueError(f"{path} exists and is no earlier result: choose another name")
+            found = "damaged"
+        if found != kind:
+            raise ValueError(f"{path} exists and is no earlier {kind}: choose another name")
 
 
 def load_evaluation(path: Path) -> dict:
@@ -181,7 +184,7 @@ def is_of_agent(evaluation: dict, folder: Path) -> bool:
         return False
     parameters, metadata = load_controller(folder / CONTROLLER_FILE)
     drove = checksum_of_arrays(parameters=parameters), metadata["variant"]
-    return (evaluation["controller"], evaluation["variant"]) == drove
+    return (evaluation.get("controller"), evaluation["variant"]) == drove
 
 
 def is_near(found: Any, value: float | list[float]) -> bool:

@@ -121,6 +121,7 @@ def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> di
     if count < FEWEST_TRAJECTORIES:
         expected = f"expected at least {FEWEST_TRAJECTORIES}, to fit and measure on"
         raise ValueError(f"episodes={count}: {expected}")
+    made_with = provenance("python -m stad_lab probe --run ...")  # before the work
     model = load_world_model(run_folder(source))
     drivers = two_drivers(random_trajectories(count, PROBE_SEED, processes), processes)
     encoder = encoder_of(model, {"z, h": model.mdn_rnn})
@@ -130,7 +131,7 @@ def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> di
         **model.checksums,
         "trajectories": count,
         "drivers": {name: probe_trajectories(*driven, encoder) for name, driven in drivers.items()},
-        "made_with": provenance("python -m stad_lab probe --run ..."),
+        "made_with": made_with,
     }
 
 

@@ -74,7 +74,7 @@ def is_left_over(file: Path, process: int) -> bool:
 def write_bytes(path: Path, content: bytes | memoryview) -> None:
     """Write a file so that a crash, or an OSError, leaves the old version or the new one."""
     # A random name, opened exclusively: nobody can have put a link there.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.part")
+    temporary = path.with_name(f".{os.getpid()}.{secrets.token_hex(4)}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with temporary.open("xb") as file:

@@ -1,6 +1,7 @@
 """The report of a run: one HTML file with its scores, a film, its curves and what made it."""
 
 import html
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,7 @@ def scores(folder: Path) -> str:
     """The evaluations of this C, or what to do if there is none."""
     found = [one for one in evaluations_of(folder).values() if is_of_agent(one, folder)]
     if not found:
-        command = html.escape(f"python -m stad_lab evaluate --agent {folder}")
+        command = html.escape(f"python -m stad_lab evaluate --agent {shlex.quote(str(folder))}")
         return f"<p>Not evaluated yet: <code>{command}</code></p>"
     rows = {}
     for one in found:
@@ -106,7 +107,7 @@ def about(record: dict) -> str:
     """Command, times, budget, machine and versions, and the whole configuration, folded."""
     made, spent = record["made_with"], record.get("budget", {})
     rows = {"variant": record["variant"], "command": made.get("command", "not recorded")}
-    rows |= {f"time of {name}": f"{t:.0f} s" for name, t in record["seconds"].items()}
+    rows |= {f"time of {name}": f"{t:.0f} s" for name, t in record.get("seconds", {}).items()}
     for name, count in spent.items():
         if isinstance(count, dict) and count["episodes"]:
             rows[name.replace("_", " ")] = (
@@ -115,7 +116,9 @@ def about(record: dict) -> str:
     rows |= {name.replace("_", " "): made[name] for name in MACHINE if name in made}
     rows["versions"] = ", ".join(f"{name} {made[name]}" for name in PACKAGES if name in made)
     if len(starts(record)) > 1:
-        rows["continued"] = f"{len(starts(record)) - 1} times, on another machine or version"
+        rows["continued"] = (
+            f"{len(starts(record)) - 1} times, with another command, version or machine"
+        )
     config = {name: value for name, _, value in fields_of(Config.from_dict(record["config"]))}
     return f"{table(rows)}<details><summary>Configuration</summary>{table(config)}</details>"
 

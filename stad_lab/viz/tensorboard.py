@@ -63,7 +63,10 @@ class TensorBoard:
 
     def add_agent(self, folder: Path) -> None:
         """Add the film of a run's agent and the latents of its episode, if there is an agent."""
-        if (folder / CONTROLLER_FILE).exists():
+        there = (folder / CONTROLLER_FILE).exists()
+        if not there and not self.written:
+            return  # or earlier curves would be erased for nothing
+        if there:
             agent = load_agent(folder)
             self.add_film("agent", film_agent(agent, **FILM))
             self.add_latents(folder, record_trajectory(agent, FILM["track"], FRAMES))

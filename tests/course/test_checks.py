@@ -6,7 +6,7 @@ import torch
 from IPython.core.interactiveshell import InteractiveShell
 from traitlets.config import Config
 
-from stad_course.checks import WrongAnswer, ask, check
+from stad_course.checks.answers import WrongAnswer, ask, check
 
 RIGHT = np.array([0.5, -2.0, 3.0], np.float32)
 

@@ -57,6 +57,18 @@ def test_a_submission_that_breaks_down_costs_itself_alone_and_its_author_reads_w
     assert results["student00"]["failures"] == [] and min(results["student00"]["returns"]) > 0
 
 
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows lets not every user make links")
+def test_a_link_in_a_submission_is_not_followed(tmp_path):
+    (folder := tmp_path / "one").mkdir()
+    (folder / "agent.py").write_text("")
+    (secret := tmp_path / "secret.json").write_text("1")
+    (folder / "link").symlink_to(secret)
+    before = fingerprint(folder)
+    with secret.open("wb") as file:
+        file.truncate(LARGEST_SUBMISSION + 1)
+    assert fingerprint(folder) == before
+
+
 def test_a_trained_run_can_be_handed_in_as_it_is_with_its_large_dataset(tmp_path):
     run = tmp_path / "run"
     shutil.copytree(PRETRAINED / "cropped_input", run)
@@ -66,6 +78,7 @@ def test_a_trained_run_can_be_handed_in_as_it_is_with_its_large_dataset(tmp_path
             file.truncate(LARGEST_SUBMISSION + 1)  # a hole, which takes no disk
     with pytest.raises(Failure, match="MB, at most 300"):
         copied(run, tmp_path)
+    assert fingerprint(run).endswith(" bytes")  # it is not read
     shutil.rmtree(run / "more")
     (out := tmp_path / "out").mkdir()
     before = fingerprint(run)
@@ -248,15 +261,17 @@ def test_a_failure_that_no_track_shows_and_a_forged_answer_count(
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no fork")
-def test_what_a_dead_submission_has_started_is_not_waited_for(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("number", "named"), [(9, "SIGKILL"), (40, "signal 40")])
+def test_what_a_dead_submission_has_started_is_not_waited_for(number, named, tmp_path, monkeypatch):
     monkeypatch.setattr("stad_course.compete.process.can_isolate", lambda: False)
-    line = "import os, time\n        if os.fork(): os.kill(os.getpid(), 9)\n        time.sleep(60)"
+    die = f"if os.fork(): os.kill(os.getpid(), {number})"
+    line = f"import os, time\n        {die}\n        time.sleep(60)"
     path = tmp_path / "agent.py"
     path.write_text(TWO.format(line=line))
     result = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
     begin = time.monotonic()
     drive_batch(path, [0], result, Limits(), ())
-    assert "SIGKILL" in result["failures"][0] and time.monotonic() - begin < 30
+    assert named in result["failures"][0] and time.monotonic() - begin < 30
 
 
 def test_who_used_up_the_whole_time_reads_the_limit_of_the_whole(tmp_path):

@@ -272,6 +272,14 @@ def test_many_dreams_at_once_are_those_of_single_environments():
     assert np.abs(np.array(envs.render()) - pictures).max() <= 1
 
 
+def test_the_action_of_an_ended_dream_is_ignored_and_each_dream_has_a_seed_of_its_own():
+    envs = make_dreams(max_frames=1)
+    envs.reset(seed=7)
+    assert envs.np_random_seed == (7, 8, 9)
+    envs.step(np.zeros((3, 3)))  # all have ended
+    assert not envs.step(np.full((3, 3), np.nan))[3].any()
+
+
 def test_dreams_that_are_not_begun_closed_or_given_nonsense_say_so():
     envs = make_dreams(max_frames=1, autoreset_mode="Disabled", render_mode="rgb_array")
     for act in (lambda: envs.step(np.zeros((3, 3))), envs.render):
@@ -284,6 +292,8 @@ def test_dreams_that_are_not_begun_closed_or_given_nonsense_say_so():
     envs.step(np.zeros((3, 3)))
     with pytest.raises(RuntimeError, match="have ended: call reset"):
         envs.step(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="one at least"):
+        envs.reset(options={"reset_mask": np.zeros(3, bool)})
     envs.reset(options={"reset_mask": np.array([True, True, True])})
     envs.close()
     with pytest.raises(ClosedEnvironmentError):

@@ -97,7 +97,7 @@ def test_a_mask_of_no_car_of_another_shape_or_of_numbers_is_refused(mask):
 
 def test_the_first_reset_is_of_all_cars():
     envs = CarRacingVector(CARS)
-    with pytest.raises(ValueError, match="the first reset is of all cars"):
+    with pytest.raises(ValueError, match="the first reset is of all, leave it out"):
         envs.reset(options={"reset_mask": np.array([True, False, False])})
     with pytest.raises(ResetNeeded):
         envs.step(np.zeros((CARS, 3), np.float32))

@@ -194,10 +194,17 @@ def test_an_evaluation_overwrites_no_other_file(name, quick_run, tmp_path, capsy
     assert (file.read_bytes() if file.exists() else None) == before
 
 
-def test_an_earlier_result_may_be_overwritten(tmp_path):
+def test_an_earlier_result_may_be_overwritten_by_one_of_its_kind_alone(tmp_path):
     shutil.copy(PRETRAINED / "frame" / "evaluation.json", tmp_path / "result.json")
-    check_output(tmp_path / "result.json")
-    check_output(tmp_path / "new.json")
+    check_output(tmp_path / "result.json", "evaluation")
+    check_output(tmp_path / "new.json", "probe")
+    with pytest.raises(ValueError, match="is no earlier probe: choose another name"):
+        check_output(tmp_path / "result.json", "probe")
+
+
+def test_a_file_may_have_the_longest_name_that_the_system_takes(tmp_path):
+    save_json(tmp_path / f"{'n' * 250}.json", {"kind": "a"})
+    assert load_json(tmp_path / f"{'n' * 250}.json") == {"kind": "a"}
 
 
 def test_a_result_is_written_where_it_is_asked_for_and_not_over_a_folder_or_a_device(

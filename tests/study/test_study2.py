@@ -21,10 +21,10 @@ SIXTEEN = [Run(300, "frame", 16)]
 
 
 def write_tables(folder, scores):
-    """Tables of runs, each with its score on 20 tracks."""
+    """Tables of runs, each with its score on all tracks."""
     rng, lines = np.random.default_rng(0), []
     for run, score in scores.items():
-        returns = score + rng.normal(0, 1, 20)
+        returns = score + rng.normal(0, 1, 400)
         columns = {str(1000 + track): one for track, one in enumerate(returns)}
         made = {"mean": score, "processor": "a CPU", "controller": "c"}
         lines.append(run._asdict() | columns | made)
@@ -64,6 +64,17 @@ def test_the_comparison_waits_for_the_last_run(tmp_path):
     assert found["comparison"]["episodes"] == 4
     assert found["scores"]["input_output, 4 each"] == [840.0] * 5
     assert found["scores"]["frame, 1 each"] == [700.0] * 2
+
+
+def test_a_run_without_all_its_returns_is_refused(tmp_path):
+    scores = dict.fromkeys(FOUR, 800.0) | dict.fromkeys(ONE, 700.0)
+    write_tables(tmp_path, scores)
+    write_tables(tmp_path, scores | dict.fromkeys(find_runs(STUDY2, to=tmp_path)[4:], 800.0))
+    table = tables.read("study2_returns", tmp_path)
+    table.loc[3, "1007"] = np.nan
+    tables.save("study2_returns", table, tmp_path)
+    with pytest.raises(ValueError, match="study2_returns: expected a return of each run"):
+        describe_study2(tmp_path)
 
 
 def quick(generations):

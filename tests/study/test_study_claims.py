@@ -168,7 +168,7 @@ def test_the_secondary_outcomes_of_an_arm_are_those_of_its_episodes(found, full)
     assert arm["tenth_percentile"] == np.percentile(flat, 10)
     assert arm["interquartile_mean"] == pytest.approx(flat[1200:3600].mean())
     # 100, 300, 500 at equal distances: the mean height is 300, more by the gain and the seed.
-    curves = study_claims.learning_curves("study1", full)["z: output"]
+    curves = study_claims.learning_curves(full)["z: output"]
     areas = [300 - 60 + seed for seed in range(SEEDS)]
     assert study_claims.area_under(*curves) == pytest.approx(areas)
     assert arm["area"] == pytest.approx(np.mean(areas))

@@ -37,6 +37,11 @@ def test_a_held_key_moves_the_action_smoothly_and_a_released_one_lets_it_fall_ba
     assert hand.act()[0] == 0
 
 
+def test_before_the_first_frame_the_path_is_empty(session):
+    session.begin(1)
+    assert session.path().shape == (0, 2) and session.by_hand().shape == (0,)
+
+
 def test_an_agent_drives_in_a_session_exactly_as_alone(session):
     session.give("agent")
     drive(session, ("", 40))
