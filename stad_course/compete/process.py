@@ -205,7 +205,7 @@ class Submission:
             self.process.wait(2)
         status = self.process.returncode
         if status is not None and status < 0:
-            named = {number.value: number.name for number in signal.Signals}  # real-time ones lack
+            named = {number.value: number.name for number in signal.Signals}
             return f"its process was ended by {named.get(-status, f'signal {-status}')}"
         return f"its process ended by itself (exit status {status})"
 

@@ -255,8 +255,8 @@ def test_a_failure_that_no_track_shows_and_a_forged_answer_count(
     path = tmp_path / "agent.py"
     path.write_text(TWO.format(line=line))
     result = {"returns": [], "failures": [], "seconds": 0.0, "laps": {}}
-    drive_batch(path, tracks, result, Limits(), ())
-    assert result["returns"].count(LOST) == lost
+    drive_batch(path, tracks, result, Limits(step=10.0), ())  # a busy machine is no fault
+    assert result["returns"].count(LOST) == lost, result["failures"]
     assert len(result["failures"]) == 1 and said in result["failures"][0]
 
 
