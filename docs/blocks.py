@@ -34,6 +34,7 @@ from stad_study.figures import (
     plot_study,
 )
 from stad_study.study import STUDIES
+from stad_study.study5 import ARMS
 from stad_study.study_claims import FAMILIES, FEATURES, MARGIN
 from stad_study.verdict import (
     PAPER_GAIN,
@@ -145,7 +146,7 @@ def cause(claims: dict) -> str:
         tables = [cause_table(study), repeated_table(study, claims["study1"])]
         parts = [meaning, image("study5", claims), *tables, *parts]
         if "study5_curves" in drawable(claims):
-            parts.append(image("study5_curves", claims))
+            parts += [changed_table(study), image("study5_curves", claims)]
     return "\n\n".join(parts)
 
 
@@ -177,6 +178,18 @@ def repeated_table(study: dict, first: dict) -> str:
         ]
         lines.append((f"`{variant}`", *(f"{now:.0f} (study 1: {then:.0f})" for now, then in both)))
     return table(("mean of the seeds", *SEEN.values()), lines)
+
+
+def changed_table(study: dict) -> str:
+    """The means of the arms of parts 5b and 5c, below those whose C sees z as it is."""
+    variants, changes = ("frame", "input_output"), ["z"]
+    for _, sees in (*ARMS["5c"], *ARMS["5b"]):
+        changes += [sees] if sees not in changes else []
+    lines = []
+    for sees in changes:
+        arms = [study["arms"].get(f"{variant}: {sees}") for variant in variants]
+        lines.append((f"C sees {sees}", *(f"{one['mean']:.0f}" if one else "" for one in arms)))
+    return table(("mean of the seeds", *(f"`{variant}`" for variant in variants)), lines)
 
 
 def strongest(claims: dict) -> str:

@@ -1,5 +1,6 @@
 """The statistics of study 5: nothing is tested before a part is complete, and effects are found."""
 
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -156,7 +157,12 @@ def test_the_page_shows_the_tests_of_complete_parts_alone(
     assert f"5c {max(0, 144 - missing)} of 144" in page
     assert ("study5" in blocks.drawable(claims)) == (rows > 0)
     assert ("study5_curves.png" in page) == (rows == 11)
+    assert ("| C sees z + motion |" in page) == (rows == 11)
     if rows == 11:
+        arms = (f"{variant}: z + motion" for variant in ("frame", "input_output"))
+        frame, both = (f"{study['arms'][arm]['mean']:.0f}" for arm in arms)
+        assert f"| C sees z + motion | {frame} | {both} |" in page
+        assert re.search(r"\| C sees z - placebo \|  \| 8\d\d \|", page)
         panels = blocks.FIGURES["study5_curves"](claims).axes
         named = [[line.get_label() for line in panel.lines] for panel in panels]
         seen = "z", "z + motion", "z + placebo", "z + action"
