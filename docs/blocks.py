@@ -102,11 +102,11 @@ def gains(claims: dict) -> str:
         told.append(f"{name_verdict(one)} ({round(one['difference'])} points)")
     both, alone = told
     if out_of_reach(study, "z, h"):
-        both += "; the paper's gain was out of reach"
+        both += "; the paper's gain had hardly any room"
     return (
         "Does it help to see and reconstruct what has moved? A paper says so. We trained agents"
-        " with and without it twelve times each. With a memory, as the paper's controller probably"
-        f" has it: {both}. Without: {alone}."
+        " with and without it twelve times each. If the driver sees the memory, as probably in the"
+        f" paper: {both}. If not: {alone}."
     )
 
 
@@ -503,15 +503,14 @@ def faster_recipe(claims: dict) -> str:
     outcome = "does not" if found["not_worse"] else "may"
     pairs, seeds = len(found["scores"]["study6_fast"]), len(STUDIES["study6_fast"].seeds)
     return (
-        f"A run took {found['minutes']['study6_fast']:.0f} minutes with `fast` and"
-        f" {found['minutes']['study6_laptop']:.0f} with `laptop` (medians; V and M trained on one"
-        " core)."
-        f" [Study 6](protocol.md#study-6-a-faster-recipe): `fast` {outcome} lose {MARGIN} "
-        f"points or more against `laptop`. Over {pairs} pairs the mean difference is "
-        f"{found['difference']:+.1f} points, with a standard deviation of "
-        f"{found['deviation']:.0f}, and its one-sided 95% bound {found['lower_bound']:+.1f}; from "
-        f"the means of {seeds} seeds the bound is {found['lower_bound_of_seeds']:+.1f}. V was of "
-        "`frame` or `input_output`, and C saw z and h."
+        "With V and M trained on one core, a run took"
+        f" {found['minutes']['study6_fast']:.0f} minutes with `fast` and"
+        f" {found['minutes']['study6_laptop']:.0f} with `laptop` (medians)."
+        f" `fast` {outcome} lose {MARGIN} points or more: over {pairs} pairs the mean difference"
+        f" is {found['difference']:+.1f} points ([study 6](protocol.md#study-6-a-faster-recipe);"
+        f" standard deviation {found['deviation']:.0f}, one-sided 95% bound"
+        f" {found['lower_bound']:+.1f}, from the means of {seeds} seeds"
+        f" {found['lower_bound_of_seeds']:+.1f}; `frame` and `input_output`, z and h)."
     )
 
 

@@ -159,9 +159,9 @@ def evaluate(
 
     Args:
         agent: A shipped agent, or the folder of a run.
-        episodes: Number of tracks.
+        episodes: Number of episodes, one on each track.
         first_track: Seed of the first track.
-        fast: Render with the fast renderer instead of Gymnasium's own (not for reports).
+        fast: Drive in our engine instead of Gymnasium (not for scores that you report).
         processes: Workers that drive.
         json: Where to write every episode; by default into the run, or here for a shipped agent.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
@@ -185,7 +185,7 @@ def evaluate(
     print(f"  every episode: {file}")
 
 
-def verify(run: tyro.conf.Positional[str]) -> int:
+def verify(run: str) -> int:
     """Check a run's files, and drive three of its recorded episodes again.
 
     The exit status is 1 if a file has changed, or an episode differs on the machine of the record.

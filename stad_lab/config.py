@@ -135,7 +135,7 @@ class EvolutionConfig:
     cars: int = 16
     """Cars that drive in one batch, at most. Fewer keep more threads busy."""
     validate_every: int = 5
-    """Generations between two validations of the averaged mean."""
+    """Generations between two validations of the averaged CMA mean."""
     validation_tracks: int = 16
     """Tracks of a validation."""
     averaged_share: float = 0.4

@@ -133,7 +133,7 @@ def probe(
 
 
 def erasure(run: tyro.conf.Positional[str], processes: int = 2) -> None:
-    """Measure what is left of the motion in z after the erasure of study 5: its pilot.
+    """Pilot of study 5: erase the motion from z, and measure what is left.
 
     Args:
         run: Folder of a run's V and M, or a shipped agent.

@@ -275,8 +275,8 @@ def kept_file(pipeline: Pipeline, networks: Path) -> Path:
 def final_controller(config: Config, run: Path) -> np.ndarray:
     """The averaged CMA mean after the last generation, float64 (parameters,).
 
-    It is the outcome of a study. The C that `train` writes is the averaged mean of the generation
-    with the best validation, whose score has the noise of that choice.
+    It is the outcome of a study. The C that `train` writes is the averaged CMA mean of the
+    generation with the best validation, whose score has the noise of that choice.
     """
     world_model = load_world_model(run)
     log = read_log(config, run, world_model)

@@ -58,9 +58,9 @@ def describe_repetition(one: dict) -> str:
 
 
 def describe_ceiling(study: dict) -> str:
-    """Where the gain of the paper was out of reach, for the overview; else nothing."""
+    """Where the gain of the paper had hardly any room, for the overview; else nothing."""
     seen = [name.replace(", ", " and ") for name in SEES if out_of_reach(study, name)]
-    return f"With {' or '.join(seen)} the paper's gain was out of reach." if seen else ""
+    return f"With {' or '.join(seen)} the paper's gain had hardly any room." if seen else ""
 
 
 def describe_others(study: dict) -> str:
@@ -69,8 +69,8 @@ def describe_others(study: dict) -> str:
     verdicts = [one["verdict"] for one in others]
     if "gain" in verdicts:
         return ""
-    undecided = f"{verdicts.count('undecided')} of {len(verdicts)} undecided"
-    return f"`input` and `output`: no gain, {undecided}."
+    undecided = f"{verdicts.count('undecided')} of {len(verdicts)} comparisons undecided"
+    return f"`input` and `output`: no gain ({undecided})."
 
 
 def out_of_reach(study: dict, features: str) -> bool:

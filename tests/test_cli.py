@@ -309,7 +309,7 @@ def test_a_wrong_name_or_value_ends_in_one_clear_line(options, parts, tmp_path, 
         ("evaluate --agent", "error: Missing value for argument '--agent'"),
         ("driving", "driving"),
         ("evaluate --agent nowhere", "no trained agent named 'nowhere': expected "),
-        ("verify nowhere", "nowhere"),
+        ("verify --run nowhere", "nowhere"),
     ],
 )
 def test_wrong_usage_ends_in_one_clear_line(command, message, tmp_path, monkeypatch, capsys):
@@ -521,7 +521,7 @@ def test_an_empty_folder_is_not_the_present_one(option, tmp_path, monkeypatch, c
     assert f"{option} is empty" in error and not list(tmp_path.glob("*.npy"))
 
 
-@pytest.mark.parametrize("command", ["report --run", "verify", "train quick --out"])
+@pytest.mark.parametrize("command", ["report --run", "verify --run", "train quick --out"])
 def test_a_file_in_the_place_of_a_run_is_named(command, tmp_path, capsys):
     (tmp_path / "notes.md").write_text("mine")
     error = the_error(capsys, *command.split(), str(tmp_path / "notes.md"))

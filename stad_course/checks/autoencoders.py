@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import torch
 
-from stad_course.checks.answers import WrongAnswer, ask, check, check_interval
+from stad_course.checks.answers import WrongAnswer, ask, check
 from stad_lab.envs.frames import earlier_index
 
 
@@ -172,21 +172,3 @@ def reactions(reaction: Callable, encode: Callable) -> None:
         if max(brightest, default=0) > 1:
             remedy = "use to_tensors, which divides them by 255"
             raise WrongAnswer(what, "V was given frames from 0 to 255, not from 0 to 1", remedy)
-
-
-def mean_intervals(mean_interval: Callable) -> None:
-    """The bootstrap interval of the mean of twelve values."""
-    values = np.array([3.0, 9.0, 4.0, 1.0, 5.0, 2.0, 6.0, 5.0, 3.0, 12.0, 5.0, 5.0])
-    place = "say where an episode lies, not the mean"
-    bounds = {
-        f"these are percentiles of the values, which {place}: resample": (1.275, 11.175),
-        "this is a 90% interval: take the percentiles 2.5 and 97.5": (3.75, 6.45),
-        "nearly a point: draw with replacement, and take the mean of each sample": (5.0, 5.0),
-        "this is the formula with 1.96, which is symmetric, and these values are not: draw": (
-            3.37,
-            6.63,
-        ),
-        f"two standard deviations around the mean {place}: resample": (-0.9, 10.9),
-    }
-    given = values, np.random.default_rng(0)
-    check_interval("mean_interval", mean_interval, given, (3.5, 6.8), bounds, 0.02)

@@ -53,15 +53,14 @@ def new_means(new_mean: Callable) -> None:
     """The mean of the better half of ten points, and of seven."""
     source = np.random.default_rng(1)
     for size in (10, 7):
-        population, fitness = source.standard_normal((size, 3)), 1.0 * source.permutation(size)
-        order, w, half = np.argsort(fitness), right_weights(size), size // 2
+        population, cost = source.standard_normal((size, 3)), 1.0 * source.permutation(size)
+        order, w, half = np.argsort(cost), right_weights(size), size // 2
         best = population[order]
         mistakes = {
-            "this is the mean of the worst: fitness is a cost here, low is good": w
-            @ best[::-1][:half],
+            "this is the mean of the worst: low is good here": w @ best[::-1][:half],
             "this is the plain mean of the better half: weigh it": best[:half].mean(axis=0),
             "this is the mean of all points: selection is missing": population.mean(axis=0),
-            "the population was not sorted: take the rows in the order of their fitness": w
+            "the population was not sorted: take the rows in the order of their cost": w
             @ population[:half],
             "these are the rows at the ranks: argsort once, the best come first": w
             @ population[np.argsort(order)[:half]],
@@ -69,7 +68,7 @@ def new_means(new_mean: Callable) -> None:
             "this is the best point alone: one chance score would steer CMA-ES": best[0],
         }
         what = f"new_mean of {size} points"
-        found = ask(what, new_mean, population, fitness)
+        found = ask(what, new_mean, population, cost)
         check(what, found, w @ best[:half], mistakes, tolerance=1e-3)
 
 

@@ -127,7 +127,7 @@ def horizons(horizon: Callable) -> None:
     dream = np.array(
         [[1.0, 6.0, 2.0, 4.0, 6.0], [1.0, 5.0, 5.0, 13.0, 13.0], [1.0, 1.0, 1.0, 1.0, 3.0]]
     )
-    constant = np.repeat([[5.0], [10.0], [2.0]], 5, axis=1)
+    average = np.repeat([[5.0], [10.0], [2.0]], 5, axis=1)
     most = (
         "at this step most episodes err more, or it is the last one: compare sums, find the first"
     )
@@ -136,23 +136,23 @@ def horizons(horizon: Callable) -> None:
         "only a single episode errs more there: take the sums over the episodes": 2,
         most: 5,
     }
-    check("horizon", ask("horizon", horizon, dream, constant), 4, mistakes)
+    check("horizon", ask("horizon", horizon, dream, average), 4, mistakes)
     twice, what = dream[:, [0, 3, 1, 4]], "horizon, if they meet twice"
     mistakes = {
         "this is the second time that they err more: find the first place": 4,
         "this is the place of a column: steps count from 1, so add 1": 1,
     }
-    check(what, ask(what, horizon, twice, constant[:, :4]), 2, mistakes)
+    check(what, ask(what, horizon, twice, average[:, :4]), 2, mistakes)
     what = "horizon, if they err equally at first"
-    equal = np.column_stack([dream[:, 0], constant[:, 0], dream[:, 4]])
+    equal = np.column_stack([dream[:, 0], average[:, 0], dream[:, 4]])
     mistakes = {"at this step both err equally: find the first where the dreams err more": 2}
-    check(what, ask(what, horizon, equal, constant[:, :3]), 3, mistakes)
+    check(what, ask(what, horizon, equal, average[:, :3]), 3, mistakes)
     what = "horizon, if dreams never err more"
     mistakes = {
         "argmax of no True at all is 0: ask first whether there is one": 1,
         "this is the place of the last column: steps count from 1, so add 1": 4,
     }
-    check(what, ask(what, horizon, dream, 9 + constant), 5, mistakes)
+    check(what, ask(what, horizon, dream, 9 + average), 5, mistakes)
 
 
 def horizon_intervals(horizon_interval: Callable) -> None:
@@ -175,7 +175,7 @@ def horizon_intervals(horizon_interval: Callable) -> None:
     hard = source.gamma(2.0, 0.5, (15, 1))  # on a hard episode both errors are large
     grown = hard * source.gamma(4.0, 0.25, (15, 1)) * np.linspace(0.1, 2.5, 60)
     bounds = {
-        "the constant's errors are of the same episodes: resample them together": (18, 44.5),
+        "the average picture's errors are of the same episodes: resample them together": (18, 44.5),
         "both errors of an episode belong together: sample the episodes once, for both": (16, 48.5),
     }
     dream = grown + 0.1 * source.standard_normal((15, 60))

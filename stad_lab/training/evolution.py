@@ -69,8 +69,8 @@ def evolve(
     """Evolve C for the V and M in `folder`; False if the run was complete already.
 
     The candidates of a generation drive the same tracks; their fitness is their mean return. Every
-    few generations the averaged mean of CMA-ES drives the validation tracks, and the best one so
-    far is kept: to keep the best *candidate* would be to keep the one with the easiest tracks.
+    few generations the averaged CMA mean drives the validation tracks, and the best one so far is
+    kept: to keep the best *candidate* would be to keep the one with the easiest tracks.
 
     Args:
         executor: where episodes run; None for `config.processes` threads of this machine.

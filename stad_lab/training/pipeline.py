@@ -6,7 +6,7 @@ The folder of a run::
     vae.safetensors           V
     mdn_rnn.safetensors       M
     evolution.json            every generation of CMA-ES
-    controller.safetensors    C: the averaged mean of CMA-ES with the best validation
+    controller.safetensors    C: the averaged CMA mean with the best validation
     components.safetensors    along which CMA-ES varies C, with `evolution.components`
     start.safetensors         the first C, in a second iteration or a fine-tuning
     record.json               configuration, versions, machine, time and budget of each stage

@@ -190,7 +190,7 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
 def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str) -> Figure:
     """Worst, average and best fitness of each generation: (3, generations), of `fitness_curves`.
 
-    `validation`: generation -> score of the mean driver, C, on the validation tracks.
+    `validation`: generation -> score of C on the validation tracks.
     """
     figure, ((axis,),) = new_figure(7.0, 3.8)
     generation = np.arange(1, curves.shape[1] + 1)
@@ -198,7 +198,7 @@ def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str)
     for values, name, color in zip(curves, names, (RED, BLUE, GREEN), strict=True):
         axis.plot(generation, values, color=color, lw=1.3, label=f"{name} candidate")
     if validation:
-        style = {"color": "black", "ms": 4, "label": "mean driver, validation tracks"}
+        style = {"color": "black", "ms": 4, "label": "C, validation tracks"}
         axis.plot(list(validation), list(validation.values()), "o--", **style)
     axis.axhline(SOLVED, **THIN, label=f"{SOLVED} points")
     axis.set(xlabel="generation", ylabel="fitness: mean return over the tracks")

@@ -583,7 +583,7 @@ def failures(found):
 
 
 def test_verify_drives_recorded_episodes_again(quick_run, capsys):
-    assert main(["verify", str(quick_run)]) == 0
+    assert main(["verify", "--run", str(quick_run)]) == 0
     printed = capsys.readouterr().out.replace("log of CMA-ES", "log")
     found = dict(line.split(maxsplit=1) for line in printed.splitlines())
     assert found["dataset"] == "ok: 8 episodes, 480 frames"
@@ -606,7 +606,7 @@ def test_verify_finds_a_return_that_no_episode_gives(quick_run, tmp_path, in_thi
     log = load_json(folder / "evolution.json")
     log["generations"][log["best"]["generation"] - 1]["validation"]["returns"][0] += 0.001
     save_json(folder / "evolution.json", log)
-    assert main(["verify", str(folder)]) == 1
+    assert main(["verify", "--run", str(folder)]) == 1
     message = r"episodes +FAILED: the record says \[.*\], now it was \["
     assert re.search(message, capsys.readouterr().out)
     record = load_json(folder / "record.json")

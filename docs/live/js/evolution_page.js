@@ -141,10 +141,10 @@ stad.start(async () => {
     const [points, frames] = [track.returns[chosen], track.frames[chosen]];
     const seconds = (frames / 50).toFixed(0);
     const end = track.laps[chosen]
-      ? `a whole lap in ${seconds} seconds`
+      ? `a complete lap in ${seconds} seconds`
       : frames < 1000
-        ? `it left the map after ${seconds} seconds`
-        : "no whole lap in 20 seconds";
+        ? `it left the field after ${seconds} seconds`
+        : "no complete lap in 20 seconds";
     const driven = generation * run.episodes;
     const text = `Generation ${generation}: ${points.toFixed(0)} points, ${end}.`;
     stad.get("summary").textContent =

@@ -131,7 +131,7 @@ globalThis.stad ??= {};
       const driven = `${total("frames").toLocaleString("en")} frames in ${time()}.`;
       get("driven").textContent = number ? driven : "";
       get("answer").textContent = lap
-        ? `${bet ? `You said ${bet}: the` : "The"} first whole lap came in generation ${lap}, after ${time(lap)}.`
+        ? `${bet ? `You said ${bet}: the` : "The"} first complete lap came in generation ${lap}, after ${time(lap)}.`
         : "";
       stad.describe(get("map"), `A track from above, with all candidates. ${text}`);
       stad.describe(get("learning"), `Points of ${number} generations. ${text}`);

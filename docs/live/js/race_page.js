@@ -392,10 +392,10 @@ stad.start(async () => {
     const [mine, its] = [you.score, rival.score];
     const won = mine > its ? "You beat the agent!" : mine === its ? "A draw" : "The agent wins";
     const title = helped ? "The autopilot has driven" : won;
-    const ways = ["The time is up", "A whole lap", "You left the map"];
+    const ways = ["The time is up", "A complete lap", "You left the field"];
     const text =
       `${ways[you.ending]} after ${seconds(you.frames)} s: ${mine.toFixed(1)} points. ` +
-      `Your rival has ${its.toFixed(1)}. ${recordOf(mine, helped)}`;
+      `The agent has ${its.toFixed(1)}. ${recordOf(mine, helped)}`;
     showCard(title, text);
     stad.announce(`${title} ${text} ${get("card-way").textContent}`);
   }

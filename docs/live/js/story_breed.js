@@ -53,7 +53,7 @@ stad.figure("breed", async (part) => {
     part("flag-value").textContent = generations[i];
     part("flag").setAttribute("aria-valuetext", `generation ${generations[i]}`);
     const points = planted ? `, ${facts.returns[i].toFixed(0)} points` : "";
-    const lap = planted ? (facts.laps[i] ? ", a whole lap" : ", no whole lap") : "";
+    const lap = planted ? (facts.laps[i] ? ", a complete lap" : ", no complete lap") : "";
     stad.describe(part("map"), `recorded drives of the start and 24 generations; generation ${generations[i]}${points}${lap}`); // prettier-ignore
     if (planted) part("summary").textContent = `Generation ${generations[i]}${points}${lap}.`;
     draw();
@@ -65,7 +65,7 @@ stad.figure("breed", async (part) => {
     if (planted) return;
     planted = true;
     const guess = generations[chosen()];
-    const text = `You said ${guess}: the first whole lap on this track is in generation ${generations[first]}.`;
+    const text = `You said ${guess}: the first complete lap on this track is in generation ${generations[first]}.`;
     part("answer").textContent = text;
     part("plant").setAttribute("aria-disabled", "true");
     part("play").disabled = false;

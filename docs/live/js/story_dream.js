@@ -104,7 +104,7 @@
         else one.apart ??= now; // a slow device draws fewer frames than it dreams
         if (one.apart !== null && now - one.apart >= LASTING - 1) one.parted = one.apart;
       });
-      const told = dreams.map(({ parted }) => (parted === null ? "still together" : `parted after ${inSeconds(parted)} s`)); // prettier-ignore
+      const told = dreams.map(({ parted }) => (parted === null ? "still together" : `diverged after ${inSeconds(parted)} s`)); // prettier-ignore
       told.forEach((text, i) => {
         if (part(`told-${i + 1}`).textContent !== text) part(`told-${i + 1}`).textContent = text;
       });
@@ -122,7 +122,7 @@
       const answer = BOUNDS.filter((bound) => middle > bound).length;
       const told =
         middle < Infinity
-          ? `the middle one of the three parted after ${inSeconds(middle)} seconds.`
+          ? `the middle one of the three diverged after ${inSeconds(middle)} seconds.`
           : `two of the three were still together after ${inSeconds(dreams[0].dream.frames)} seconds, when they ended.`; // prettier-ignore
       const text = `${bet.choice === answer ? "Right" : "No"}: ${told}`;
       part("answer").textContent = text;

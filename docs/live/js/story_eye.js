@@ -33,7 +33,7 @@ stad.figure("eye", async (part) => {
     const some = descriptions[NAME];
     return some.reduce((best, one, i) => (follows(one) > follows(some[best]) ? i : best), 0);
   });
-  const words = ["distance from the middle of the road", "steering", "turning (yaw rate)"];
+  const words = ["road offset", "wheel angle (steering)", "yaw rate (turning)"];
   const sliders = chosen.map((latent, i) => {
     const label = document.createElement("label");
     label.className = "wide";

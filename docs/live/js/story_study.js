@@ -45,7 +45,7 @@ stad.figure("study", async (part) => {
     const found = rows.map(({ name, difference, interval }) => `${name}: ${difference.toFixed(1)} points (95% interval ${interval.map((end) => end.toFixed(1)).join(" to ")})`).join(". "); // prettier-ignore
     const text = `${found}. The paper: ${paper} points`;
     part("answer").textContent =
-      "Hardly any, on average. Without the memory it is more: see below.";
+      "Hardly any, on average. If it sees z alone it is more: see below.";
     stad.describe(part("chart"), text);
     stad.announce(text);
     part("after").hidden = part("paper").hidden = false;

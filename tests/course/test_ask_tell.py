@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from stad_course import ten_lines
+from stad_course import ask_tell
 
 
-def test_ten_lines_climb_a_hill():
+def test_two_functions_climb_a_hill():
     rng, mean = np.random.default_rng(0), np.full(5, 3.0)
     for generation in range(40):
-        candidates = ten_lines.ask(mean, 0.9**generation, 20, rng)
-        mean = ten_lines.tell(candidates, -(candidates**2).sum(axis=1))
+        candidates = ask_tell.ask(mean, 0.9**generation, 20, rng)
+        mean = ask_tell.tell(candidates, -(candidates**2).sum(axis=1))
     assert np.abs(mean).max() < 0.1
 
 
@@ -22,7 +22,7 @@ def test_right_functions_are_used(capsys):
         ranked = candidates[np.argsort(returns)]
         return ranked[-(len(returns) // 4) :].mean(axis=0)
 
-    assert ten_lines.yours_or_ours(own_ask, own_tell) == (own_ask, own_tell)
+    assert ask_tell.yours_or_ours(own_ask, own_tell) == (own_ask, own_tell)
     assert "are right" in capsys.readouterr().out
 
 
@@ -45,6 +45,6 @@ def test_right_functions_are_used(capsys):
 )
 @pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # a root of a negative number
 def test_a_wrong_function_is_diagnosed_and_ours_is_used(own_ask, own_tell, said, capsys):
-    chosen = ten_lines.yours_or_ours(own_ask or ten_lines.ask, own_tell or ten_lines.tell)
-    assert chosen == (ten_lines.ask, ten_lines.tell)
+    chosen = ask_tell.yours_or_ours(own_ask or ask_tell.ask, own_tell or ask_tell.tell)
+    assert chosen == (ask_tell.ask, ask_tell.tell)
     assert said in capsys.readouterr().out
