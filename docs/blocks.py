@@ -102,7 +102,7 @@ def gains(claims: dict) -> str:
         told.append(f"{name_verdict(one)} ({round(one['difference'])} points)")
     both, alone = told
     if out_of_reach(study, "z, h"):
-        both += "; the paper's gain had hardly any room"
+        both += "; the paper's gain hardly fits below the ceiling"
     return (
         "Does it help to see and reconstruct what has moved? A paper says so. We trained agents"
         " with and without it twelve times each. If the driver sees the memory, as probably in the"
