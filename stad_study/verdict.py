@@ -60,7 +60,8 @@ def describe_repetition(one: dict) -> str:
 def describe_ceiling(study: dict) -> str:
     """Where the gain of the paper hardly fits below the ceiling, for the overview; else nothing."""
     seen = [name.replace(", ", " and ") for name in SEES if out_of_reach(study, name)]
-    return f"With {' or '.join(seen)} the paper's gain hardly fits below the ceiling." if seen else ""
+    seen_by = " or ".join(seen)
+    return f"With {seen_by} the paper's gain hardly fits below the ceiling." if seen else ""
 
 
 def describe_others(study: dict) -> str:
