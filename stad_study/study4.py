@@ -26,16 +26,18 @@ from stad_lab.config import VARIANTS, Config
 from stad_lab.evaluation.statistics import FAILED
 from stad_lab.io.files import checksum_of_arrays, load_json, locked, save_json
 from stad_lab.io.weights import CONTROLLER_FILE, load_controller
+from stad_lab.io.workers import TaskError
 from stad_lab.training.evolution import LOG
 from stad_lab.training.fine_tuning import fine_tune
 from stad_lab.training.pipeline import train
-from stad_lab.training.record import RECORD, total_budget
+from stad_lab.training.record import RECORD, provenance, starts, total_budget
 from stad_study import tables
 from stad_study.experiments import EXPERIMENTS
 from stad_study.networks import NETWORKS
 from stad_study.ship import copy_in_half
 from stad_study.study import (
     COLLECTING,
+    MADE_WITH,
     SCORE,
     STUDIES,
     WAIT,
@@ -91,24 +93,37 @@ def run_study4(
 
     After an interruption the same call continues. A run that another process does is left to it;
     each computes on one thread. With `only`, recorded runs are run, too, and compared. ValueError
-    as `find_runs`, and for a folder with a recorded run that `only` names.
+    as `find_runs`, for a folder with a recorded run that `only` names, and at the end for runs that
+    failed: a run of hours does not wait for another's mistake.
     """
-    root, wanted = Path(folder) / NAME, find_runs(seeds, only)
+    root, wanted, failed = Path(folder) / NAME, find_runs(seeds, only), []
     refuse_repeated(root, [run for run in wanted if only and recorded(run, to)])
     for run in wanted:
-        with claimed(root / run.name) as ours:
-            was = recorded(run, to)
-            if not ours or (was and not only):
-                continue
-            print(f"{run.name}: {describe_progress(to)}", flush=True)
-            score = run_one(run, root)
-            found = f"mean return {score['mean']:.1f}"
-            if was:
-                found += f", recorded {was['mean']:.1f} on {was['processor']}"
-            else:
-                add_run(run, root, to)
-            print(f"{run.name}: {found}", flush=True)
+        try:
+            do_run(run, root, to, repeat=bool(only))
+        except (OSError, ValueError, TaskError) as error:
+            print(f"{run.name}: {error}", flush=True)
+            failed.append(run.name)
     print(f"{NAME}: {describe_progress(to)}")
+    if failed:
+        raise ValueError(f"{', '.join(failed)}: not finished, for the reason above")
+
+
+def do_run(run: Run, root: Path, to: Path, repeat: bool) -> None:
+    """Run and add what is not in the tables; with `repeat` run what is there, too, and compare."""
+    with claimed(root / run.name) as ours:
+        was = recorded(run, to)
+        if not ours or (was and not repeat):
+            return
+        print(f"{run.name}: {describe_progress(to)}", flush=True)
+        score = run_one(run, root)
+        if was:
+            found = f"mean return {score['mean']:.1f}, recorded {was['mean']:.1f}"
+            print(f"{run.name}: {found} on {was['processor']}", flush=True)
+            return
+        add_run(run, root, to)
+        # Not its score: the agents are chosen by validation.
+        print(f"{run.name}: is finished and in the tables", flush=True)
 
 
 def run_one(run: Run, root: Path) -> dict:
@@ -118,6 +133,7 @@ def run_one(run: Run, root: Path) -> dict:
         return load_json(folder / SCORE, kind="score")
     first, second, tuned = (folder / stage for stage in STAGES)
     configs, data = run.configs, root / f"seed{run.seed}"
+    made_with = provenance(f"python -m stad_study replicate {NAME} --only {run.name} --out ...")
     with fixed_threads():
         with locked(data, COLLECTING):
             shared = configs["first"].replace(variant="frame")
@@ -130,22 +146,28 @@ def run_one(run: Run, root: Path) -> dict:
         begin, limits = time.perf_counter(), {"max_frames": STUDIES["study1"].max_frames}
         score = drive_tracks(agent, TRACKS, processes=1, label=run.name, limits=limits)
     seconds = time.perf_counter() - begin
-    save_json(
-        folder / SCORE, {"kind": "score", "variant": run.variant, **score, "seconds": seconds}
-    )
+    told = {"kind": "score", "variant": run.variant, "made_with": made_with}
+    save_json(folder / SCORE, {**told, **score, "seconds": seconds})
     return score
 
 
 def describe_run(folder: Path, score: dict) -> dict:
-    """The line of runs: score, validation by which agents are chosen, machine, seconds, budget."""
+    """The line of runs: score, validation by which agents are chosen, machines, seconds, budget.
+
+    "processors" of a stage has all on which it was started or continued.
+    """
     returns = np.array([episode["return"] for episode in score["episodes"]])
     records = {stage: load_json(folder / stage / RECORD) for stage in STAGES}
     made, log = records["tuned"]["made_with"], load_json(folder / "tuned" / LOG)
-    line = {"mean": float(returns.mean()), "minimum": float(returns.min())}
+    line: dict = {"mean": float(returns.mean()), "minimum": float(returns.min())}
     line["below_800"] = float((returns < FAILED).mean())
     line["validation"], line["generation"] = log["best"]["validation"], log["best"]["generation"]
     line |= {name: made[name] for name in ("commit", "processor", "torch", "numpy")}
+    line |= {f"world_model.{name}": records["second"]["made_with"][name] for name in MADE_WITH}
+    line |= {f"score.{name}": score["made_with"][name] for name in ("processor", "numba")}
     for stage, record in records.items():
+        used = dict.fromkeys(start["processor"] for start in starts(record))
+        line[f"processors.{stage}"] = "; ".join(used)
         line[f"seconds.{stage}"] = round(sum(record["seconds"].values()), 1)
     line["seconds.score"] = round(score["seconds"], 1)
     line |= total_budget(records["tuned"])

@@ -9,11 +9,12 @@ from stad_lab.agent import load_agent
 from stad_lab.config import VARIANTS, Config
 from stad_lab.io.files import load_json
 from stad_lab.training.fine_tuning import FINE_TUNING
+from stad_lab.training.record import processor
 from stad_study import study4, tables
 from stad_study.cli import main
 from stad_study.experiments import EXPERIMENTS
 from stad_study.study import STUDIES
-from stad_study.study4 import Run, add_run, find_runs, run_study4
+from stad_study.study4 import STAGES, Run, add_run, find_runs, run_study4
 
 BRIEF = {"generations": 2, "validate_every": 1, "max_frames": 20}
 FIRST = Config.preset("quick", vae={"steps": 8, "batch": 8}, mdn_rnn={"steps": 4}, evolution=BRIEF)
@@ -68,6 +69,25 @@ def test_the_score_is_of_the_agent_as_it_is_kept(made):
     assert np.array_equal(kept.parameters, load_agent(run / "agent").parameters)
     assert line["validation"] == load_json(run / "tuned/evolution.json")["best"]["validation"]
     assert line["agents"] == 3 * 2 * 4
+
+
+def test_the_line_of_a_run_says_what_each_stage_and_the_score_were_made_with(made):
+    line, here = study4.recorded(RUN, made / "data"), processor()
+    names = ("score.processor", "world_model.processor", *(f"processors.{s}" for s in STAGES))
+    assert {line[name] for name in names} == {here}
+    assert line["world_model.trained_on"] == "cpu" and line["score.numba"]
+
+
+def test_a_run_that_fails_is_named_at_the_end_and_the_others_are_done(tmp_path, capsys):
+    folder = tmp_path / "study4" / RUN.name / "first"
+    folder.mkdir(parents=True)
+    (folder / "record.json").write_text("{")
+    with pytest.raises(ValueError, match="seed400/frame: not finished, for the reason above"):
+        run_study4(tmp_path, only=[RUN.name, "seed401/frame"], to=tmp_path / "data")
+    told = capsys.readouterr().out
+    assert "seed401/frame: is finished and in the tables" in told and "mean return" not in told
+    assert "record.json" in told
+    assert len(tables.read("study4_runs", tmp_path / "data")) == 1
 
 
 def test_a_recorded_run_is_repeated_in_an_empty_folder_alone(made, tmp_path, capsys):
