@@ -255,7 +255,7 @@ def film(agent: str, out: str, track: int = 5, first: int = 60, frames: int = 24
         agent: A shipped agent, or the folder of a run.
         out: The .gif to write.
         track: Seed of the track.
-        first: First frame shown; 60 is after the opening zoom.
+        first: First frame shown, from 1 on; 60 is after the opening zoom.
         frames: Frames covered; every third is shown.
     """
     file = output(out)

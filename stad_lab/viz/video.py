@@ -84,23 +84,23 @@ def film_agent(agent: Agent, track: int, first: int, frames: int) -> bytes:
 def repeated_dreams(
     agent: Agent, trajectory: Trajectory, first: int, length: int = DREAM
 ) -> np.ndarray:
-    """Dreams of `length` frames, each from where the trajectory then is.
+    """Dreams of `length` frames, each from where the trajectory then is; `first` is at least 1.
 
     Returns a picture for each frame from `first` on, uint8 (len(trajectory) - first, 64, 64, 3).
     """
     agent.reset()
     dreams: list[np.ndarray] = []
     for moment, observation in enumerate(trajectory.observations):
-        agent.act(observation)  # as in the episode, so that M has its memory of that moment
         if moment >= first and (moment - first) % length == 0:
             frames = min(length, len(trajectory) - moment)
             dreams.append(dream_on(agent, frames, seed=len(dreams))[0])
+        agent.act(observation)  # as in the episode, so that M has its memory of that moment
     return np.concatenate(dreams)
 
 
 def record_longer(agent: Agent, track: int, first: int, frames: int) -> Trajectory:
     """An episode of at most `first + frames` frames; raises as `film_agent`."""
-    for name, value, least in (("track", track, 0), ("first", first, 0), ("frames", frames, 1)):
+    for name, value, least in (("track", track, 0), ("first", first, 1), ("frames", frames, 1)):
         if value < least:
             raise ValueError(f"{name}={value}: expected at least {least}")
     trajectory = record_trajectory(agent, track, first + frames)

@@ -199,15 +199,15 @@ def test_a_cold_dream_continues_an_episode_step_by_step_with_m_s_memory(agent, o
         assert info["hidden"] == pytest.approx(state[0][0, 0].numpy(), abs=1e-5)
 
 
-def test_dreams_in_a_film_restart_from_the_trajectory_every_length_frames(agent):
+def test_a_dream_in_a_film_predicts_the_frame_beside_it_and_begins_again_every_length_frames(agent):
     trajectory = record_trajectory(agent, track=np.int64(3), frames=25)
     dreams = repeated_dreams(agent, trajectory, first=6, length=8)
     assert dreams.shape == (len(trajectory) - 6, 64, 64, 3)
     for number, moment in enumerate((6, 14, 22)):
         agent.reset()
-        for observation in trajectory.observations[: moment + 1]:
+        for observation in trajectory.observations[:moment]:
             action = agent.act(observation)
-        assert np.array_equal(action, trajectory.actions[moment])
+        assert np.array_equal(action, trajectory.actions[moment - 1])
         length = min(8, len(trajectory) - moment)
         dream, _ = dream_on(agent, length, seed=number)
         assert np.array_equal(dreams[moment - 6 :][:length], dream)

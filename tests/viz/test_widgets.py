@@ -87,7 +87,9 @@ def test_a_film_shows_one_frame_of_three(agent):
     count, (width, height) = pages(film_agent(agent, track=4, first=5, frames=10))
     assert count == 4 and width == 4 * 192 + 3 * 6 and height == 192 + 20
     with pytest.raises(ValueError, match="frames=0: expected"):
-        film_agent(agent, 4, 0, 0)
+        film_agent(agent, 4, 1, 0)
+    with pytest.raises(ValueError, match="first=0: expected at least 1"):
+        film_agent(agent, 4, 0, 10)
 
 
 def test_an_interrupt_within_a_figure_ends_the_training_once_the_figure_is_drawn(capsys):
