@@ -20,7 +20,7 @@ CELLS = {  # and what the front page says below
     "02-33": "With a large penalty on information, V drops the road",
     "02b-22": "How fast the car turns, read off 32 numbers",
     "03-31": "A real episode, and four dreams of it",
-    "04-19": "A driver evolves: cars of four generations",
+    "04-19": "A driver evolves: cars of four generations (orange: the best)",
     "06-15": "A good agent misses a hairpin",
 }
 

@@ -144,7 +144,7 @@ class Driver(Protocol):
         """Begin new episodes."""
 
     def act_batch(self, seen: np.ndarray) -> np.ndarray:
-        """Actions float32 (cars, 3) for what the present cars see."""
+        """Actions float32 (cars, 3) for pictures uint8 (cars, 64, 64, 3) or (cars, 96, 96, 3)."""
 
     def keep(self, cars: np.ndarray) -> None:
         """Continue with some of the present cars, by their indices."""

@@ -101,12 +101,12 @@ def run_study4(
     for run in wanted:
         try:
             do_run(run, root, to, repeat=bool(only))
-        except (OSError, ValueError, TaskError) as error:
+        except (OSError, ValueError, FloatingPointError, TaskError) as error:
             print(f"{run.name}: {error}", flush=True)
             failed.append(run.name)
     print(f"{NAME}: {describe_progress(to)}")
     if failed:
-        raise ValueError(f"{', '.join(failed)}: not finished, for the reason above")
+        raise ValueError(f"{', '.join(failed)}: not finished, for the reasons above")
 
 
 def do_run(run: Run, root: Path, to: Path, repeat: bool) -> None:
@@ -163,9 +163,10 @@ def describe_run(folder: Path, score: dict) -> dict:
     line["below_800"] = float((returns < FAILED).mean())
     line["validation"], line["generation"] = log["best"]["validation"], log["best"]["generation"]
     line |= {name: made[name] for name in ("commit", "processor", "torch", "numpy")}
+    dataset = load_json(folder.parent / RECORD)
     line |= {f"world_model.{name}": records["second"]["made_with"][name] for name in MADE_WITH}
     line |= {f"score.{name}": score["made_with"][name] for name in ("processor", "numba")}
-    for stage, record in records.items():
+    for stage, record in {"dataset": dataset, **records}.items():
         used = dict.fromkeys(start["processor"] for start in starts(record))
         line[f"processors.{stage}"] = "; ".join(used)
         line[f"seconds.{stage}"] = round(sum(record["seconds"].values()), 1)

@@ -58,10 +58,10 @@ def describe_repetition(one: dict) -> str:
 
 
 def describe_ceiling(study: dict) -> str:
-    """Where the gain of the paper hardly fits below the ceiling, for the overview; else nothing."""
+    """Where the gain of the paper was out of reach, for the overview; else nothing."""
     seen = [name.replace(", ", " and ") for name in SEES if out_of_reach(study, name)]
     seen_by = " or ".join(seen)
-    return f"With {seen_by} the paper's gain hardly fits below the ceiling." if seen else ""
+    return f"With {seen_by} the paper's gain exceeds our recipe's reach." if seen else ""
 
 
 def describe_others(study: dict) -> str:
@@ -70,7 +70,7 @@ def describe_others(study: dict) -> str:
     verdicts = [one["verdict"] for one in others]
     if "gain" in verdicts:
         return ""
-    undecided = f"{verdicts.count('undecided')} of {len(verdicts)} comparisons undecided"
+    undecided = f"{verdicts.count('undecided')} of {len(verdicts)} undecided"
     return f"`input` and `output`: no gain ({undecided})."
 
 

@@ -177,7 +177,7 @@ def test_a_generation_shows_its_path_its_points_and_its_dream(opened):
         words, generation = page.inner_text("#summary"), facts["generations"][place]
         expected = round(facts["tracks"][0]["returns"][place])
         assert f"{generation}: {expected} points" in words
-        assert ("complete lap in" in words) == facts["tracks"][0]["laps"][place]
+        assert ("a complete lap in" in words) == facts["tracks"][0]["laps"][place]
         page.wait_for_function(f"track.ariaLabel.includes('Generation {generation}:')")
 
 

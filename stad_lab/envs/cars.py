@@ -36,7 +36,7 @@ class Cars:
     """`count` independent cars, each on its own track, with the rules of Gymnasium's CarRacing-v3.
 
     Threads may work at once on different `Cars`; the compiled code releases the GIL. An episode
-    that has ended is not restarted.
+    that has ended is not restarted, and none ends by time.
 
     Args:
         count: number of cars, 1 to 100,000.

@@ -3,8 +3,7 @@
 Make it by its name::
 
     envs = gymnasium.make_vec(
-        "stad_lab:StadLab/Dream-v0", num_envs=16, vectorization_mode="vector_entry_point",
-        agent="frame", temperature=1.0,
+        "stad_lab:StadLab/Dream-v0", num_envs=16, agent="frame", temperature=1.0
     )
 """
 

@@ -2,9 +2,7 @@
 
 Make it by its name::
 
-    envs = gymnasium.make_vec(
-        "stad_lab:StadLab/CarRacing-v3", num_envs=16, vectorization_mode="vector_entry_point"
-    )
+    envs = gymnasium.make_vec("stad_lab:StadLab/CarRacing-v3", num_envs=16)
 """
 
 from collections.abc import Sequence

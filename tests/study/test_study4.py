@@ -1,15 +1,16 @@
 """Study 4: whole runs of three stages, of which the best by validation is kept."""
 
 import dataclasses
+import shutil
 
 import numpy as np
 import pytest
 
 from stad_lab.agent import load_agent
 from stad_lab.config import VARIANTS, Config
-from stad_lab.io.files import load_json
+from stad_lab.io.files import load_json, save_json
 from stad_lab.training.fine_tuning import FINE_TUNING
-from stad_lab.training.record import processor
+from stad_lab.training.record import RECORD, processor
 from stad_study import study4, tables
 from stad_study.cli import main
 from stad_study.experiments import EXPERIMENTS
@@ -73,16 +74,26 @@ def test_the_score_is_of_the_agent_as_it_is_kept(made):
 
 def test_the_line_of_a_run_says_what_each_stage_and_the_score_were_made_with(made):
     line, here = study4.recorded(RUN, made / "data"), processor()
-    names = ("score.processor", "world_model.processor", *(f"processors.{s}" for s in STAGES))
-    assert {line[name] for name in names} == {here}
+    stages = [f"processors.{stage}" for stage in ("dataset", *STAGES)]
+    assert {line[one] for one in ("score.processor", "world_model.processor", *stages)} == {here}
     assert line["world_model.trained_on"] == "cpu" and line["score.numba"]
+
+
+def test_a_stage_that_went_on_elsewhere_names_both_processors(made, tmp_path):
+    seed = shutil.copytree(made / "study4/seed400", tmp_path / "seed400")
+    record = load_json(seed / "frame/tuned" / RECORD)
+    record["continued_with"] = [record["made_with"] | {"processor": "another"}]
+    save_json(seed / "frame/tuned" / RECORD, record)
+    line = study4.describe_run(seed / "frame", load_json(seed / "frame/score.json"))
+    assert line["processors.tuned"] == f"{processor()}; another"
+    assert line["processors.second"] == processor()
 
 
 def test_a_run_that_fails_is_named_at_the_end_and_the_others_are_done(tmp_path, capsys):
     folder = tmp_path / "study4" / RUN.name / "first"
     folder.mkdir(parents=True)
     (folder / "record.json").write_text("{")
-    with pytest.raises(ValueError, match="seed400/frame: not finished, for the reason above"):
+    with pytest.raises(ValueError, match="seed400/frame: not finished, for the reasons above"):
         run_study4(tmp_path, only=[RUN.name, "seed401/frame"], to=tmp_path / "data")
     told = capsys.readouterr().out
     assert "seed401/frame: is finished and in the tables" in told and "mean return" not in told

@@ -124,7 +124,7 @@ globalThis.stad ??= {};
       const text = number
         ? `Generation ${number}: best ${points(best)} points, average ${points(average)}, ` +
           `mean driver ${average(last.mean).toFixed(0)}. ` +
-          `Whole laps: ${last.laps} of ${settings.population}. σ ${sigma}.`
+          `Complete laps: ${last.laps} of ${settings.population}. σ ${sigma}.`
         : "Nobody has driven yet.";
       get("summary").textContent = text;
       const time = (count) => `${total("seconds", count).toFixed(0)} seconds`;

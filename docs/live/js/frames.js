@@ -94,7 +94,7 @@ stad.Drive = class {
 
 {
   const size = stad.FRAME_SIZE;
-  // Orange for brighter than before, purple for darker: matplotlib's PuOr_r, thinned out.
+  // Orange for lighter than before, purple for darker: matplotlib's PuOr_r, thinned out.
   // prettier-ignore
   const COLORS = [
     [45, 0, 75], [84, 39, 136], [128, 115, 172], [178, 171, 210], [216, 218, 235], [247, 247, 247],

@@ -59,7 +59,7 @@
       driving = true;
       await approach();
       driving = false;
-      dreams = canvases.map(() => ({ dream: dreamOf(seed++), apart: null, parted: null }));
+      dreams = canvases.map(() => ({ dream: dreamOf(seed++), apart: null, diverged: null }));
       for (const { dream } of dreams) dream.temperature = Number(part("temperature").value);
       over = false;
       draw();
@@ -99,12 +99,12 @@
         const { frame } = vae.decode(one.dream.z);
         stad.paintFrame(canvases[i], frame);
         const now = one.dream.frames;
-        if (now === 0 || one.parted !== null) return;
+        if (now === 0 || one.diverged !== null) return;
         if (disagreement(frame, real) <= SAME) one.apart = null;
         else one.apart ??= now; // a slow device draws fewer frames than it dreams
-        if (one.apart !== null && now - one.apart >= LASTING - 1) one.parted = one.apart;
+        if (one.apart !== null && now - one.apart >= LASTING - 1) one.diverged = one.apart;
       });
-      const told = dreams.map(({ parted }) => (parted === null ? "still together" : `diverged after ${inSeconds(parted)} s`)); // prettier-ignore
+      const told = dreams.map(({ diverged }) => (diverged === null ? "still together" : `diverged after ${inSeconds(diverged)} s`)); // prettier-ignore
       told.forEach((text, i) => {
         if (part(`told-${i + 1}`).textContent !== text) part(`told-${i + 1}`).textContent = text;
       });
@@ -112,13 +112,13 @@
       part("time").textContent = `${time} s with closed eyes`;
       stad.describe(part("real"), `the real road, ${time} seconds after the eyes closed`);
       canvases.forEach((canvas, i) => stad.describe(canvas, `dream ${i + 1}, ${told[i]}`));
-      const known = dreams.filter(({ parted }) => parted !== null).length > 1;
+      const known = dreams.filter(({ diverged }) => diverged !== null).length > 1;
       if (bet && (known || over)) settle();
     }
 
-    /** The bet is on the middle one of three dreams, so it is known when two have parted. */
+    /** The bet is on the middle one of three dreams, so it is known when two have diverged. */
     function settle() {
-      const middle = dreams.map(({ parted }) => parted ?? Infinity).sort((a, b) => a - b)[1];
+      const middle = dreams.map(({ diverged }) => diverged ?? Infinity).sort((a, b) => a - b)[1];
       const answer = BOUNDS.filter((bound) => middle > bound).length;
       const told =
         middle < Infinity

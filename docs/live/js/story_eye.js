@@ -33,7 +33,7 @@ stad.figure("eye", async (part) => {
     const some = descriptions[NAME];
     return some.reduce((best, one, i) => (follows(one) > follows(some[best]) ? i : best), 0);
   });
-  const words = ["road offset", "wheel angle (steering)", "yaw rate (turning)"];
+  const words = ["road offset (place across the road)", "wheel angle (steering)", "yaw rate (turning)"];
   const sliders = chosen.map((latent, i) => {
     const label = document.createElement("label");
     label.className = "wide";
