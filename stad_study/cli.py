@@ -26,8 +26,8 @@ def replicate(
 ) -> None:
     """Run a study of the protocol, such as study1, or an earlier experiment, with all its seeds.
 
-    It says first how long it will take. Stop it when you like; the same command continues. The
-    pipelines of a study are added to the tables of stad_study/data as they finish.
+    Stop it when you like; the same command continues. The pipelines of a study are added to the
+    tables of stad_study/data as they finish.
 
     Args:
         experiment: Its name: study1, study2, study4, study5, study6_laptop, study6_fast, pilot,

@@ -160,7 +160,7 @@ stad.LONGEST = 1000; // frames of an episode
     ["palette", () => 8 * 256],
   ];
 
-  /** Memory of the module: what is taken after `mark()` is given back by `reset()`. */
+  /** Memory of the module: what is taken after noting `top` is given back by setting it again. */
   class Memory {
     constructor() {
       this.instance = null;

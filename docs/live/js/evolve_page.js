@@ -54,7 +54,6 @@ stad.start(async () => {
       scores,
       mean: mean.map(({ score }) => score),
       laps: driven.filter((one) => one.some(({ lap }) => lap)).length,
-      meanLap: mean.every(({ lap }) => lap),
       frames: [...driven, mean].flat().reduce((total, { frames }) => total + frames, 0),
       seconds: (performance.now() - began - idle) / 1000,
       checksum: state.checksum,

@@ -41,12 +41,12 @@ stad.readPicture = async (url) => {
 stad.Drive = class {
   /**
    * @param {CanvasRenderingContext2D} sheet all frames side by side
-   * @param {{frames: number, columns: number, track: number}} facts
+   * @param {{frames: number, columns: number}} facts
    * @param {Float32Array} actions (frames, 3)
    */
   constructor(sheet, facts, actions) {
     [this.sheet, this.actions] = [sheet, actions];
-    [this.length, this.columns, this.track] = [facts.frames, facts.columns, facts.track];
+    [this.length, this.columns] = [facts.frames, facts.columns];
     this.kept = new Map();
   }
 

@@ -15,7 +15,7 @@ stad.start(async () => {
   let [best, asleep, sleptAt] = [readBest(), false, null];
   let seen = true; // whether enough of the picture is in the window
   let still = stad.prefersStill(); // whether the demonstration before a race stands still
-  let left = false; // after Esc the arrow keys are the page's, until the reader comes back
+  let released = false; // after Esc the arrow keys are the page's, until the reader comes back
   let { seed, agent, driver } = readAddress();
   const held = new Map();
   const worker = await startWorker();
@@ -378,7 +378,7 @@ stad.start(async () => {
       over: ["Press the up arrow", "to race again"],
     }[state.phase];
     if (!keys) return set("card-way", "");
-    const way = touching ? "Touch the picture" : left ? "Click the picture" : keys[0];
+    const way = touching ? "Touch the picture" : released ? "Click the picture" : keys[0];
     set("card-way", `${way} ${keys[1]}.`);
   }
 
@@ -451,7 +451,7 @@ stad.start(async () => {
   }
 
   function begin() {
-    left = false;
+    released = false;
     wake();
     setAuto(false);
     worker.postMessage({ type: "begin", phase: "race" });
@@ -505,7 +505,7 @@ stad.start(async () => {
 
   /** Esc: the keys are the page's again. */
   function leave() {
-    left = true;
+    released = true;
     setPaused(true);
     document.activeElement.blur();
     showWay();
@@ -520,7 +520,7 @@ stad.start(async () => {
 
   /** A driver has touched a pedal: begin, or go on. */
   function wish() {
-    left = false;
+    released = false;
     if (state?.phase === "attract") begin();
     else if (state?.phase === "paused") setPaused(false);
     else if (state?.phase === "over" && performance.now() - endedAt > 1500) begin(); // not by chance
@@ -537,7 +537,7 @@ stad.start(async () => {
     if (target.isContentEditable || target.matches(TAKES_KEYS)) return;
     const { phase } = state;
     const inside = seen && get("seat").contains(document.activeElement);
-    const racing = inside || (phase === "race" && !left);
+    const racing = inside || (phase === "race" && !released);
     const free = document.activeElement === document.body; // no other control wants the keys
     if (!racing && !(seen && free)) return;
     if (event.key === "Escape") return leave();
@@ -545,7 +545,7 @@ stad.start(async () => {
     if (event.key.toLowerCase() === "e" && !event.repeat) return toggleEyes();
     const pedal = KEYS[event.code];
     if (!pedal || (event.code === "Space" && target.matches("button, input"))) return;
-    if (left && !racing) return;
+    if (released && !racing) return;
     // The down arrow and space move the page, unless there is a race to brake in. A key that is
     // still down at the end of a race moves nothing.
     const brakes = racing && (phase === "race" || phase === "paused");

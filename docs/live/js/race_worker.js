@@ -38,7 +38,7 @@ stad.Racer = class {
 
   report() {
     const { car } = this;
-    const facts = { score: car.score, frames: car.frames, over: car.over, ending: car.ending };
+    const facts = { score: car.score, frames: car.frames, ending: car.ending };
     return { ...facts, tiles: car.tilesVisited / car.track.count, pose: car.pose() };
   }
 };

@@ -3,7 +3,7 @@
 
 stad.figure("eye", async (part) => {
   const NAME = "input_output";
-  const [LOST, REACH] = [1, 4]; // the right answer; how far a slider goes
+  const [RIGHT, REACH] = [1, 4]; // the right answer; how far a slider goes
   const [descriptions, agent] = await Promise.all([stad.load("latents"), stad.loadDriver(NAME)]);
   const { vae } = agent;
   const pictures = await drive();
@@ -33,7 +33,11 @@ stad.figure("eye", async (part) => {
     const some = descriptions[NAME];
     return some.reduce((best, one, i) => (follows(one) > follows(some[best]) ? i : best), 0);
   });
-  const words = ["road offset (place across the road)", "wheel angle (steering)", "yaw rate (turning)"];
+  const words = [
+    "road offset (place across the road)",
+    "wheel angle (steering)",
+    "yaw rate (turning)",
+  ];
   const sliders = chosen.map((latent, i) => {
     const label = document.createElement("label");
     label.className = "wide";
@@ -77,7 +81,7 @@ stad.figure("eye", async (part) => {
     const text = "The squares are gone: leaving them out adds the least error.";
     part("answer").textContent = text;
     stad.announce(text);
-    return LOST;
+    return RIGHT;
   });
   part("another").addEventListener("click", () => take(place + 1));
   part("back").addEventListener("click", () => take(place));

@@ -6,7 +6,7 @@ stad.figure("hairpin", async (part) => {
   const [agent, engine] = await Promise.all([stad.loadDriver(NAME), stad.loadEngine()]);
   const [track, car] = [engine.makeTrack(TRACK), engine.makeCar()];
   const line = stad.middleLine(track);
-  const WIDE = 20 / 3; // half the width of the road
+  const HALF_WIDTH = 20 / 3; // of the road, world units
   let [mark, path, lost, over, begun] = [null, [], [], false, false];
   let wanted = false; // whether the reader wants the car to drive
   car.reset(track);
@@ -26,7 +26,7 @@ stad.figure("hairpin", async (part) => {
       const { x, y } = car.pose();
       const { tile, distance } = nearest(x, y);
       path.push([x, y]);
-      if (distance > 1.5 * WIDE) lost.push({ tile, frame: car.frames, at: [x, y] });
+      if (distance > 1.5 * HALF_WIDTH) lost.push({ tile, frame: car.frames, at: [x, y] });
     }
     if (car.over) finish();
   }
@@ -53,8 +53,8 @@ stad.figure("hairpin", async (part) => {
     const { context, width } = cleared;
     const { place, scale } = stad.projectMap(line, width);
     context.lineJoin = "round";
-    stad.strokeLine(context, [...line, line[0]].map(place), "#8a8a8a", 2 * WIDE * scale);
-    stad.strokeLine(context, line.slice(0, 2).map(place), "white", 2 * WIDE * scale);
+    stad.strokeLine(context, [...line, line[0]].map(place), "#8a8a8a", 2 * HALF_WIDTH * scale);
+    stad.strokeLine(context, line.slice(0, 2).map(place), "white", 2 * HALF_WIDTH * scale);
     stad.strokeLine(context, path.map(place), "#0072B2", 2);
     for (const { at } of lost) stad.fillDot(context, place(at), 3, "#D55E00");
     if (mark !== null) {

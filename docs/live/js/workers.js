@@ -6,7 +6,8 @@ globalThis.stad ??= {};
 stad.whatIsMissing = () => {
   if (typeof WebAssembly !== "object") return "It needs WebAssembly: please update your browser.";
   if (typeof Worker === "undefined") return "It needs workers: please update your browser.";
-  if (typeof DecompressionStream === "undefined") return "It needs a newer browser: please update yours.";
+  if (typeof DecompressionStream === "undefined")
+    return "It needs a newer browser: please update yours.";
   // A module with one SIMD instruction.
   const simd = [
     0, 97, 115, 109, 1, 0, 0, 0, 1, 5, 1, 96, 0, 1, 123, 3, 2, 1, 0, 10, 10, 1, 8, 0, 65, 0, 253,
