@@ -182,11 +182,8 @@ def repeated_table(study: dict, first: dict) -> str:
 
 def changed_table(study: dict) -> str:
     """The means of the arms of parts 5b and 5c, below those whose C sees z as it is."""
-    variants, changes = ("frame", "input_output"), ["z"]
-    for _, sees in (*ARMS["5c"], *ARMS["5b"]):
-        changes += [sees] if sees not in changes else []
-    lines = []
-    for sees in changes:
+    variants, lines = ("frame", "input_output"), []
+    for sees in dict.fromkeys(["z", *(sees for _, sees in ARMS["5c"] + ARMS["5b"])]):
         arms = [study["arms"].get(f"{variant}: {sees}") for variant in variants]
         lines.append((f"C sees {sees}", *(f"{one['mean']:.0f}" if one else "" for one in arms)))
     return table(("mean of the seeds", *(f"`{variant}`" for variant in variants)), lines)

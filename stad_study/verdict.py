@@ -59,9 +59,8 @@ def describe_repetition(one: dict) -> str:
 
 def describe_ceiling(study: dict) -> str:
     """Where the gain of the paper was out of reach, for the overview; else nothing."""
-    seen = [name.replace(", ", " and ") for name in SEES if out_of_reach(study, name)]
-    seen_by = " or ".join(seen)
-    return f"With {seen_by} the paper's gain exceeds our recipe's reach." if seen else ""
+    seen = " or ".join(name.replace(", ", " and ") for name in SEES if out_of_reach(study, name))
+    return f"With {seen} the paper's gain exceeds our recipe's reach." if seen else ""
 
 
 def describe_others(study: dict) -> str:
