@@ -29,7 +29,7 @@ stad.Dream = class {
 };
 
 /** What V and M make of a recorded episode: z of each frame, and M's memory before it. */
-stad.Memory = class {
+stad.EncodedEpisode = class {
   constructor(vae, mdnRnn, drive) {
     [this.vae, this.mdnRnn, this.drive] = [vae, mdnRnn, drive];
     [this.latents, this.before] = [[], [mdnRnn.emptyState()]];

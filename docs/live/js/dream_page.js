@@ -17,7 +17,7 @@ stad.start(async () => {
   let waiting = false; // for M, to read the drive as far as a wish
   let [distances, spreads, diverged] = [[], [], null];
   let others = []; // distances of earlier dreams from the same frame
-  let [vae, mdnRnn, controller, memory] = [null, null, null, null];
+  let [vae, mdnRnn, controller, encoded] = [null, null, null, null];
 
   const hand = new stad.Hand();
   const clock = new stad.Clock(step, draw);
@@ -60,7 +60,7 @@ stad.start(async () => {
     const difference = drive.difference(t);
     stad.paintFrame(get("real"), frame);
     stad.paintDifference(get("real-difference"), difference);
-    const z = dream ? dream.z : memory?.latents[t];
+    const z = dream ? dream.z : encoded?.latents[t];
     shown = z ? vae.decode(z) : { frame, difference }; // V still reads: show what it will see
     stad.paintFrame(get("dream"), shown.frame);
     stad.paintDifference(get("dream-difference"), shown.difference);
@@ -106,7 +106,7 @@ stad.start(async () => {
     const names = { agent: "C drives", hand: "you drive", recorded: "recorded actions" };
     const wheel = names[over && driver === "recorded" ? "agent" : driver]; // nothing else is recorded
     set("t", `${t}${over ? ", the recording has ended" : ""}`);
-    set("dream-name", dream ? "The dream" : memory?.latents[t] ? "Reconstruction" : "Seen");
+    set("dream-name", dream ? "The dream" : encoded?.latents[t] ? "Reconstruction" : "Seen");
     const open = waiting ? "M is processing the episode up to this frame." : "The eyes are open.";
     set("dream-note", dream ? `${(dream.frames / 50).toFixed(1)} s, ${wheel}` : open);
     set("eyes", dream ? "Open the eyes" : waiting ? "Keep them open" : "Close the eyes here");
@@ -152,11 +152,11 @@ stad.start(async () => {
   /** Begin a dream at the present frame, as soon as M remembers the drive up to it. */
   async function closeEyes(start = t) {
     const wish = ++request;
-    if (!memory || memory.length <= start) {
+    if (!encoded || encoded.length <= start) {
       waiting = true;
       setPlaying(false);
       draw();
-      while (!memory || memory.length <= start) {
+      while (!encoded || encoded.length <= start) {
         await new Promise((done) => setTimeout(done, 20));
         if (wish !== request) return;
       }
@@ -166,8 +166,8 @@ stad.start(async () => {
     [t, from] = [start, start];
     dream = new stad.Dream(
       mdnRnn,
-      memory.latents[from],
-      memory.before[from],
+      encoded.latents[from],
+      encoded.before[from],
       new stad.Random(seed++),
     );
     dream.temperature = Number(get("temperature").value);
@@ -207,10 +207,10 @@ stad.start(async () => {
 
   /** Let V and M read the drive, in the background of a dream. */
   async function readDrive() {
-    while (memory.length < drive.length) {
+    while (encoded.length < drive.length) {
       const begin = performance.now();
-      memory.advance();
-      if (memory.length === t + 1 && !clock.running) draw();
+      encoded.advance();
+      if (encoded.length === t + 1 && !clock.running) draw();
       const rest = 4 * (performance.now() - begin);
       if (dream && clock.running) await new Promise((done) => setTimeout(done, rest));
       else await stad.pause();
@@ -314,14 +314,14 @@ stad.start(async () => {
     stad.MDNRNN.load(AGENT),
     stad.loadController(AGENT),
   ]);
-  memory = new stad.Memory(vae, mdnRnn, drive);
+  encoded = new stad.EncodedEpisode(vae, mdnRnn, drive);
   get("eyes").disabled = false;
   stad.page = {
     drive,
     vae,
     mdnRnn,
     controller,
-    memory,
+    encoded,
     clock,
     get dream() {
       return dream;
