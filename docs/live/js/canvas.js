@@ -73,3 +73,10 @@ stad.projectMap = (points, width, margin = 14) => {
 /** The middle of each tile of a track. */
 stad.middleLine = (track) =>
   Array.from({ length: track.count }, (_, i) => [track.path[4 * i + 2], track.path[4 * i + 3]]);
+
+/** The point of a line that is nearest to a place: its number, and how far away it is. */
+stad.nearest = (line, [x, y]) => {
+  const distances = line.map(([a, b]) => Math.hypot(a - x, b - y));
+  const distance = Math.min(...distances);
+  return { tile: distances.indexOf(distance), distance };
+};

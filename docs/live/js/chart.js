@@ -2,8 +2,6 @@
 // A small line chart on a canvas, in the colours of the theme.
 globalThis.stad ??= {};
 
-stad.COLORS = { blue: "#0072B2", orange: "#E69F00", green: "#009E73", red: "#D55E00" };
-
 stad.Chart = class {
   /**
    * @param {HTMLCanvasElement} canvas its size on the page is given by the style sheet

@@ -5,6 +5,16 @@ globalThis.stad ??= {};
 /** The element with an id. */
 stad.get = (id) => document.getElementById(id);
 
+/** Colours that the colour-blind tell apart. */
+stad.COLORS = {
+  blue: "#0072B2",
+  orange: "#E69F00",
+  green: "#009E73",
+  red: "#D55E00",
+  purple: "#CC79A7",
+  sky: "#56B4E9",
+};
+
 {
   const SECOND = 1000; // milliseconds between two texts, so that a screen reader keeps up
 

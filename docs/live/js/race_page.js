@@ -4,10 +4,7 @@
 stad.start(async () => {
   const get = stad.get;
   const AGENTS = ["frame", "input", "output", "input_output", "cropped_input"];
-  const [ORANGE, BLUE, PURPLE] = ["#E69F00", "#0072B2", "#CC79A7"];
   const SIZES = [32, 256]; // how many numbers z and h have
-  // World units: half the field, the height of the picture, and half the road's width.
-  const [FIELD, VIEW, HALF_WIDTH] = [333, 62, 6.67];
   const lacking = stad.whatIsMissing();
   if (lacking) throw new Error(lacking);
 
@@ -63,7 +60,7 @@ stad.start(async () => {
   function receive(message) {
     if (message.type === "error") return stad.fail(new Error(message.text.split("\n")[0]));
     if (message.type === "track") {
-      track = prepare(message.track);
+      track = stad.prepareRoad(message.track);
       return;
     }
     [before, state, arrived] = [state, message, performance.now()];
@@ -74,233 +71,22 @@ stad.start(async () => {
 
   // --- Drawing ------------------------------------------------------------------------------------
 
-  const PIECE = 20; // tiles
-
-  /** The road in pieces, each as one path for each shade, and the whole as a line for the map. */
-  function prepare(found) {
-    const polygon = (path, corners, i) => {
-      path.moveTo(corners[8 * i], corners[8 * i + 1]);
-      for (let k = 1; k < 4; k++) path.lineTo(corners[8 * i + 2 * k], corners[8 * i + 2 * k + 1]);
-      path.closePath();
-    };
-    const colors = ["#666", "#696969", "#6b6b6b", "#fff", "#e8342c"]; // the last two are kerbs
-    const pieces = [];
-    for (let first = 0; first < found.count; first += PIECE) {
-      const middle = 4 * Math.min(first + PIECE / 2, found.count - 1);
-      const layers = colors.map((color) => ({ color, path: new Path2D() }));
-      pieces.push({ x: found.path[middle + 2], y: found.path[middle + 3], layers });
-    }
-    const layersOf = (tile) => pieces[Math.floor(tile / PIECE)].layers;
-    for (let i = 0; i < found.count; i++) polygon(layersOf(i)[i % 3].path, found.tiles, i);
-    found.kerbTiles.forEach((tile, i) =>
-      polygon(layersOf(tile)[3 + (tile % 2)].path, found.kerbs, i),
-    );
-    const line = stad.middleLine(found);
-    const [xs, ys] = [line.map(([x]) => x), line.map(([, y]) => y)];
-    const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
-    return { ...found, pieces, line, box };
-  }
-
-  /** A pose between the last two steps, so that the picture moves at the screen's rate. */
-  function between(name, share) {
-    const [now, was] = [state[name].pose, before?.[name].pose];
-    if (!was || Math.hypot(now.x - was.x, now.y - was.y) > 10) return now; // a new episode
-    const mix = (a, b) => a + (b - a) * share;
-    const wheels = now.wheels.map((one, i) => one.map((value, k) => mix(was.wheels[i][k], value)));
-    const [x, y, angle] = ["x", "y", "angle"].map((part) => mix(was[part], now[part]));
-    return { x, y, angle, wheels, speed: now.speed };
-  }
-
   function draw() {
     requestAnimationFrame(draw);
     if (!state || !track || document.hidden || !seen) return;
-    const cleared = stad.clearCanvas(get("race"));
-    if (!cleared) return;
-    const { context, width, height } = cleared;
     const share = Math.min(1, (performance.now() - arrived) / 20);
-    const cars = { you: between("you", share), rival: between("rival", share) };
-    const shown = state.phase === "attract" ? cars.rival : cars.you;
-    const scale = height / VIEW;
-    context.save();
-    context.fillStyle = "#333"; // beyond the field
-    context.fillRect(0, 0, width, height);
-    context.translate(width / 2, height * 0.72);
-    context.scale(scale, -scale);
-    context.rotate(-shown.angle);
-    context.translate(-shown.x, -shown.y);
-    drawGrass(context, shown, width / scale);
-    const reach = Math.max(VIEW, width / scale) + 2 * PIECE; // a piece is less than 4 * PIECE long
-    for (const { x, y, layers } of track.pieces) {
-      if (Math.hypot(x - shown.x, y - shown.y) > reach) continue;
-      for (const { color, path } of layers) {
-        context.fillStyle = color;
-        context.fill(path);
-      }
-    }
-    drawStart(context);
-    if (state.phase === "attract") drawCar(context, cars.rival, BLUE, 1);
-    else {
-      drawCar(context, cars.rival, BLUE, 0.65);
-      drawCar(context, cars.you, ORANGE, 1);
-    }
-    context.restore();
-    if (state.phase === "race" && !asleep) drawWayBack(context, width, height, cars.you);
-    drawMap(context, width, height, cars);
-    drawSpeed(context, width, height, shown.speed);
-    if (touching && state.phase === "race") drawPads(context, width, height);
-  }
-
-  /** Where a finger steers. */
-  function drawPads(context, width, height) {
-    const steers = new Set(held.values());
-    context.font = "600 44px system-ui, sans-serif";
-    context.textAlign = "center";
-    for (const [side, x, sign] of [
-      ["left", 40, "\u25c0"],
-      ["right", width - 40, "\u25b6"],
-    ]) {
-      context.fillStyle = steers.has(side) ? "#fff" : "#fff9";
-      context.fillText(sign, x, height / 2);
-    }
-    if (!touched) drawHint(context, width, height);
-  }
-
-  /** What a finger does, until it has done it. */
-  function drawHint(context, width, height) {
-    context.font = "600 17px system-ui, sans-serif";
-    context.fillStyle = "#000b";
-    context.beginPath();
-    context.roundRect(width / 2 - 130, 0.28 * height - 25, 260, 62, 10);
-    context.fill();
-    context.fillStyle = "#fff";
-    context.fillText("Hold a side to steer.", width / 2, 0.28 * height);
-    context.fillText("Gas comes by itself.", width / 2, 0.28 * height + 24);
-  }
-
-  function drawGrass(context, { x, y }, wide) {
-    const [square, reach] = [FIELD / 10, Math.max(VIEW, wide)];
-    context.fillStyle = "#5fae57";
-    context.fillRect(-FIELD, -FIELD, 2 * FIELD, 2 * FIELD);
-    context.fillStyle = "#56a44e";
-    const within = (value) => Math.max(-FIELD, Math.min(FIELD, value));
-    const first = (value) => Math.floor(within(value - reach) / (2 * square)) * 2 * square;
-    for (let left = first(x); left < within(x + reach); left += 2 * square)
-      for (let low = first(y); low < within(y + reach); low += 2 * square)
-        context.fillRect(left, low, square, square);
-  }
-
-  function drawStart(context) {
-    context.fillStyle = "#fff";
-    const corners = track.tiles.subarray(0, 8);
-    context.beginPath();
-    context.moveTo(corners[0], corners[1]);
-    context.lineTo(corners[2], corners[3]);
-    context.lineWidth = 0.8;
-    context.strokeStyle = "#fff";
-    context.stroke();
-  }
-
-  // The car of Gymnasium, in world units.
-  const HULL = [
-    [-1.2, 2.6, 1.2, 2.6, 1.2, 2.2, -1.2, 2.2],
-    [-0.3, 2.4, 0.3, 2.4, 1, 0.4, -1, 0.4],
-    [0.5, 0.5, 1, 0.2, 1, -1, 0.4, -1.8, -0.4, -1.8, -1, -1, -1, 0.2, -0.5, 0.5],
-    [-1, -2.4, 1, -2.4, 1, -1.8, -1, -1.8],
-  ];
-
-  function drawCar(context, { x, y, angle, wheels }, color, alpha) {
-    context.globalAlpha = alpha;
-    for (const [wheelX, wheelY, turn, phase] of wheels) {
-      context.save();
-      context.translate(wheelX, wheelY);
-      context.rotate(turn);
-      context.fillStyle = "#111";
-      context.fillRect(-0.28, -0.54, 0.56, 1.08);
-      const place = 0.54 * Math.sin(phase);
-      context.fillStyle = "#999";
-      if (Math.cos(phase) > 0) context.fillRect(-0.28, place - 0.08, 0.56, 0.16);
-      context.restore();
-    }
-    context.save();
-    context.translate(x, y);
-    context.rotate(angle);
-    context.fillStyle = color;
-    for (const corners of HULL) {
-      context.beginPath();
-      for (let i = 0; i < corners.length; i += 2) context.lineTo(corners[i], corners[i + 1]);
-      context.fill();
-    }
-    context.restore();
-    context.globalAlpha = 1;
-  }
-
-  /** An arrow to the road, for a car that has left it. */
-  function drawWayBack(context, width, height, { x, y, angle }) {
-    const distances = track.line.map(([a, b]) => Math.hypot(a - x, b - y));
-    const nearest = distances.indexOf(Math.min(...distances));
-    if (distances[nearest] < 2 * HALF_WIDTH) return;
-    const [a, b] = track.line[nearest];
-    const scale = height / VIEW;
-    context.save();
-    context.translate(width / 2, height * 0.72);
-    context.rotate(angle - Math.atan2(b - y, a - x)); // the picture turns with the car
-    context.translate(7 * scale, 0);
-    context.scale(scale, scale);
-    context.fillStyle = "#fff";
-    context.beginPath();
-    for (const [right, down] of [
-      [0, -0.6],
-      [3, -0.6],
-      [3, -1.8],
-      [6, 0],
-      [3, 1.8],
-      [3, 0.6],
-      [0, 0.6],
-    ])
-      context.lineTo(right, down);
-    context.fill();
-    context.restore();
-    context.fillStyle = "#fff";
-    context.font = "600 17px system-ui, sans-serif";
-    context.textAlign = "center";
+    const pose = (name) => stad.poseBetween(before?.[name].pose, state[name].pose, share);
+    const racing = state.phase === "race";
     const told = autopilot()
       ? "It never learned to come back."
       : "The arrow leads back to the road.";
-    context.fillText(told, width / 2, 0.2 * height);
-  }
-
-  function drawMap(context, width, height, cars) {
-    const side = Math.min(150, 0.3 * width);
-    const [left, low, right, high] = track.box;
-    const scale = (side - 16) / Math.max(right - left, high - low);
-    const tall = (high - low) * scale + 16;
-    const top = width < 500 ? height - tall - 8 : 8; // on a phone the scores are above
-    const within = (value, size) => Math.max(5, Math.min(size - 5, value)); // off the road, too
-    const place = ([x, y]) => [
-      width - side - 8 + within(8 + (x - left) * scale, side),
-      top + within(8 + (high - y) * scale, tall),
-    ];
-    context.fillStyle = "#fffd";
-    context.beginPath();
-    context.roundRect(width - side - 8, top, side, tall, 8);
-    context.fill();
-    stad.strokeLine(context, [...track.line, track.line[0]].map(place), "#777", 3);
-    stad.fillDot(context, place([cars.rival.x, cars.rival.y]), 5, BLUE);
-    if (state.phase !== "attract")
-      stad.fillDot(context, place([cars.you.x, cars.you.y]), 5, ORANGE);
-  }
-
-  function drawSpeed(context, width, height, speed) {
-    context.fillStyle = "#000a";
-    context.beginPath();
-    context.roundRect(8, height - 44, 132, 36, 8);
-    context.fill();
-    context.fillStyle = "#fff";
-    context.font = "600 15px system-ui, sans-serif";
-    context.textAlign = "left";
-    context.fillText(`speed ${Math.round(speed)}`, 18, height - 28);
-    context.fillStyle = speed > 70 ? "#ff8a5c" : "#9fd49a";
-    context.fillRect(18, height - 22, Math.min(1, speed / 100) * 112, 6);
+    stad.drawRace(get("race"), {
+      track,
+      cars: { you: pose("you"), rival: pose("rival") },
+      alone: state.phase === "attract",
+      lost: racing && !asleep ? told : null,
+      fingers: racing && touching ? { steers: new Set(held.values()), hint: !touched } : null,
+    });
   }
 
   function showSeen({ frame, earlier, z, decoded }) {
@@ -310,7 +96,7 @@ stad.start(async () => {
     stad.paintDifference(get("difference"), stad.differenceImage(now, then));
     stad.paintFrame(get("decoded"), decoded);
     if (dreams) stad.paintFrame(get("dreamed"), decoded);
-    stad.drawBars(get("bars"), z, 3, () => (asleep ? PURPLE : BLUE));
+    stad.drawBars(get("bars"), z, 3, () => stad.COLORS[asleep ? "purple" : "blue"]);
   }
 
   // --- Words --------------------------------------------------------------------------------------
@@ -530,7 +316,14 @@ stad.start(async () => {
   const KEYS = { ...stad.PEDAL_KEYS, Space: "brake" };
   const TAKES_KEYS = "select, textarea, input:not([type=checkbox])";
 
-  document.addEventListener("keydown", (event) => {
+  function listenToKeys() {
+    document.addEventListener("keydown", pressKey);
+    addEventListener("keyup", ({ code }) => {
+      if (held.delete(code)) sendPedals();
+    });
+  }
+
+  function pressKey(event) {
     if (!state || event.ctrlKey || event.altKey || event.metaKey) return;
     const { target } = event;
     // What takes letters or arrow keys itself keeps them.
@@ -557,104 +350,32 @@ stad.start(async () => {
     if (autopilot()) setAuto(false);
     wish();
     sendPedals();
-  });
-  addEventListener("keyup", ({ code }) => {
-    if (held.delete(code)) sendPedals();
-  });
-  addEventListener("blur", () => {
-    held.clear();
-    sendPedals();
-    setPaused(true);
-  });
-  document.addEventListener("visibilitychange", () => {
-    if (document.hidden) setPaused(true);
-    rest();
-  });
-
-  new IntersectionObserver(
-    (entries) => {
-      seen = entries.at(-1).isIntersecting; // the newest: several may have been waiting
-      if (!seen) setPaused(true);
-      rest();
-    },
-    { threshold: 0.4 },
-  ).observe(get("race"));
-
-  // Touch: the left and the right half of the picture steer, also of a finger that slides.
-  function steer(event) {
-    const { left, width } = get("race").getBoundingClientRect();
-    const place = (event.clientX - left) / width - 0.5;
-    const side = Math.abs(place) < 0.04 ? "straight" : place < 0 ? "left" : "right";
-    if (held.get(event.pointerId) === side) return;
-    held.set(event.pointerId, side);
-    sendPedals();
   }
-  get("race").addEventListener("pointerdown", (event) => {
-    if (event.pointerType === "mouse" || state?.phase !== "race") return; // a click begins
-    event.preventDefault();
-    get("race").setPointerCapture(event.pointerId);
-    if (autopilot()) setAuto(false);
-    touched = true;
-    steer(event);
-  });
-  get("race").addEventListener("pointermove", (event) => held.has(event.pointerId) && steer(event));
-  for (const end of ["pointerup", "pointercancel", "lostpointercapture"])
-    get("race").addEventListener(end, ({ pointerId }) => held.delete(pointerId) && sendPedals());
-  const brake = get("brake");
-  const press = (down) => (event) => {
-    event.preventDefault();
-    if (down) held.set("brake", "brake");
-    else held.delete("brake");
-    sendPedals();
-  };
-  brake.addEventListener("pointerdown", press(true));
-  for (const end of ["pointerup", "pointercancel", "pointerleave"])
-    brake.addEventListener(end, press(false));
 
-  // A gamepad sends no events. When it is let go, the worker is told that, too.
-  let gripped = false;
-  setInterval(() => {
-    const [was, now] = [gripped, stad.readGamepad() !== null];
-    gripped = now;
-    if (now && !was && seen) wish(); // not while it is held: the reader may have paused since
-    if (now || was) sendPedals();
-  }, 40);
-
-  for (const id of ["card", "race"]) {
-    get(id).addEventListener("pointerdown", ({ pointerType }) => {
-      touching = pointerType !== "mouse"; // not every browser tells it with the click
-    });
-    get(id).addEventListener("click", () => {
-      wish();
+  /** A race that nobody sees or steers pauses. */
+  function listenToWindow() {
+    addEventListener("blur", () => {
+      held.clear();
       sendPedals();
+      setPaused(true);
     });
+    document.addEventListener("visibilitychange", () => {
+      if (document.hidden) setPaused(true);
+      rest();
+    });
+    new IntersectionObserver(
+      (entries) => {
+        seen = entries.at(-1).isIntersecting; // the newest: several may have been waiting
+        if (!seen) setPaused(true);
+        rest();
+      },
+      { threshold: 0.4 },
+    ).observe(get("race"));
+    addEventListener("hashchange", followAddress);
   }
-  get("easy").addEventListener("change", sendPedals);
-  get("again").addEventListener("click", begin);
-  get("another").addEventListener("click", () => {
-    drive(Math.floor(Math.random() * 10000));
-    writeAddress();
-  });
-  get("pause").addEventListener("click", togglePause);
-  get("eyes").addEventListener("click", toggleEyes);
-  get("auto").addEventListener("click", () => setAuto(!autopilot()));
-  get("agent").addEventListener("change", ({ target }) => {
-    const chosen = target.value === "evolved" ? evolved : { driver: null, agent: target.value };
-    ({ driver, agent } = chosen);
-    writeAddress();
-    change();
-  });
-  get("share").addEventListener("click", async () => {
-    writeAddress();
-    try {
-      await navigator.clipboard.writeText(location.href);
-      stad.announce("The link is copied.");
-      set("share", "Copied");
-    } catch {
-      set("share", "The link is in the address bar"); // there is no clipboard
-    }
-  });
-  addEventListener("hashchange", () => {
+
+  /** The reader has changed the address. */
+  function followAddress() {
     if (!location.hash.includes("track=")) return; // another place of the page
     const asked = readAddress();
     const [theirs, ours] = [asked.driver, driver].map((one) => stad.packDriver(one ?? []));
@@ -665,7 +386,94 @@ stad.start(async () => {
       change();
     }
     if (asked.seed !== seed) drive(asked.seed);
-  });
+  }
+
+  /** The left and the right half of the picture steer, also of a finger that slides. */
+  function steer(event) {
+    const { left, width } = get("race").getBoundingClientRect();
+    const place = (event.clientX - left) / width - 0.5;
+    const side = Math.abs(place) < 0.04 ? "straight" : place < 0 ? "left" : "right";
+    if (held.get(event.pointerId) === side) return;
+    held.set(event.pointerId, side);
+    sendPedals();
+  }
+
+  function listenToTouch() {
+    const race = get("race");
+    race.addEventListener("pointerdown", (event) => {
+      if (event.pointerType === "mouse" || state?.phase !== "race") return; // a click begins
+      event.preventDefault();
+      race.setPointerCapture(event.pointerId);
+      if (autopilot()) setAuto(false);
+      touched = true;
+      steer(event);
+    });
+    race.addEventListener("pointermove", (event) => held.has(event.pointerId) && steer(event));
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"])
+      race.addEventListener(end, ({ pointerId }) => held.delete(pointerId) && sendPedals());
+    const press = (down) => (event) => {
+      event.preventDefault();
+      if (down) held.set("brake", "brake");
+      else held.delete("brake");
+      sendPedals();
+    };
+    get("brake").addEventListener("pointerdown", press(true));
+    for (const end of ["pointerup", "pointercancel", "pointerleave"])
+      get("brake").addEventListener(end, press(false));
+  }
+
+  /** A gamepad sends no events. When it is let go, the worker is told that, too. */
+  function listenToGamepad() {
+    let gripped = false;
+    setInterval(() => {
+      const [was, now] = [gripped, stad.readGamepad() !== null];
+      gripped = now;
+      if (now && !was && seen) wish(); // not while it is held: the reader may have paused since
+      if (now || was) sendPedals();
+    }, 40);
+  }
+
+  function listenToControls() {
+    for (const id of ["card", "race"]) {
+      get(id).addEventListener("pointerdown", ({ pointerType }) => {
+        touching = pointerType !== "mouse"; // not every browser tells it with the click
+      });
+      get(id).addEventListener("click", () => {
+        wish();
+        sendPedals();
+      });
+    }
+    get("easy").addEventListener("change", sendPedals);
+    get("again").addEventListener("click", begin);
+    get("another").addEventListener("click", () => {
+      drive(Math.floor(Math.random() * 10000));
+      writeAddress();
+    });
+    get("pause").addEventListener("click", togglePause);
+    get("eyes").addEventListener("click", toggleEyes);
+    get("auto").addEventListener("click", () => setAuto(!autopilot()));
+    get("agent").addEventListener("change", ({ target }) => {
+      const chosen = target.value === "evolved" ? evolved : { driver: null, agent: target.value };
+      ({ driver, agent } = chosen);
+      writeAddress();
+      change();
+    });
+    get("share").addEventListener("click", share);
+  }
+
+  async function share() {
+    writeAddress();
+    try {
+      await navigator.clipboard.writeText(location.href);
+      stad.announce("The link is copied.");
+      set("share", "Copied");
+    } catch {
+      set("share", "The link is in the address bar"); // there is no clipboard
+    }
+  }
+
+  const listeners = [listenToKeys, listenToWindow, listenToTouch, listenToGamepad];
+  for (const listen of [...listeners, listenToControls]) listen();
 
   await choose(agent);
   drive(seed);

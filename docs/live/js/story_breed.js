@@ -38,9 +38,9 @@ stad.figure("breed", async (part) => {
     for (let i = 0; i < paths.length; i++)
       if (i !== chosen()) stad.fillDot(context, place(at(i)), 3.5, shade(i));
     const driven = paths[chosen()].slice(0, moment + 1).map(place);
-    stad.strokeLine(context, driven, "#0072B2", 2);
+    stad.strokeLine(context, driven, stad.COLORS.blue, 2);
     stad.fillDot(context, place(at(chosen())), 8, "white");
-    stad.fillDot(context, place(at(chosen())), 6, "#0072B2");
+    stad.fillDot(context, place(at(chosen())), 6, stad.COLORS.blue);
     part("time").textContent =
       `${Math.min(20, (moment * STEPS) / stad.FRAMES_A_SECOND).toFixed(0)} s`;
   }

@@ -69,7 +69,7 @@ stad.figure("eye", async (part) => {
   }
 
   function drawBars() {
-    const color = (i) => (chosen.includes(i) ? "#E69F00" : "#56B4E9");
+    const color = (i) => (chosen.includes(i) ? stad.COLORS.orange : stad.COLORS.sky);
     stad.drawBars(part("bars"), z, REACH, color);
   }
 

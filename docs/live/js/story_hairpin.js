@@ -14,19 +14,14 @@ stad.figure("hairpin", async (part) => {
 
   const clock = new stad.Clock(step, draw);
 
-  function nearest(x, y) {
-    const distances = line.map(([u, v]) => Math.hypot(u - x, v - y));
-    const least = Math.min(...distances);
-    return { tile: distances.indexOf(least), distance: least };
-  }
-
   function step() {
     for (let i = 0; i < FAST && !car.over; i++) {
       car.step(agent.act(car.frame()));
       const { x, y } = car.pose();
-      const { tile, distance } = nearest(x, y);
-      path.push([x, y]);
-      if (distance > 1.5 * HALF_WIDTH) lost.push({ tile, frame: car.frames, at: [x, y] });
+      const at = [x, y];
+      const { tile, distance } = stad.nearest(line, at);
+      path.push(at);
+      if (distance > 1.5 * HALF_WIDTH) lost.push({ tile, frame: car.frames, at });
     }
     if (car.over) finish();
   }
@@ -55,16 +50,16 @@ stad.figure("hairpin", async (part) => {
     context.lineJoin = "round";
     stad.strokeLine(context, [...line, line[0]].map(place), "#8a8a8a", 2 * HALF_WIDTH * scale);
     stad.strokeLine(context, line.slice(0, 2).map(place), "white", 2 * HALF_WIDTH * scale);
-    stad.strokeLine(context, path.map(place), "#0072B2", 2);
-    for (const { at } of lost) stad.fillDot(context, place(at), 3, "#D55E00");
+    stad.strokeLine(context, path.map(place), stad.COLORS.blue, 2);
+    for (const { at } of lost) stad.fillDot(context, place(at), 3, stad.COLORS.red);
     if (mark !== null) {
       const [x, y] = place(line[mark]);
-      stad.fillDot(context, [x, y], 9, "#E69F00");
+      stad.fillDot(context, [x, y], 9, stad.COLORS.orange);
       context.fillStyle = "black";
       context.textAlign = "center";
       context.fillText("?", x, y + 4);
     }
-    if (path.length) stad.fillDot(context, place(path.at(-1)), 6, "#0072B2");
+    if (path.length) stad.fillDot(context, place(path.at(-1)), 6, stad.COLORS.blue);
     const state = over ? part("answer").textContent : begun ? `${car.score.toFixed(0)} points` : "";
     const marked = mark === null ? "no place is marked" : `your mark is at tile ${mark}`;
     stad.describe(part("map"), `track 19 with ${track.count} tiles; ${marked}. ${state}`);
@@ -81,11 +76,7 @@ stad.figure("hairpin", async (part) => {
   part("map").addEventListener("click", ({ clientX, clientY }) => {
     const { left, top, width } = part("map").getBoundingClientRect();
     const { place } = stad.projectMap(line, width);
-    const distances = line.map((point) => {
-      const [x, y] = place(point);
-      return Math.hypot(x - (clientX - left), y - (clientY - top));
-    });
-    put(distances.indexOf(Math.min(...distances)));
+    put(stad.nearest(line.map(place), [clientX - left, clientY - top]).tile);
   });
   part("map").addEventListener("keydown", (event) => {
     const way = { ArrowLeft: -5, ArrowRight: 5 }[event.key];

@@ -33,8 +33,8 @@ stad.figure("study", async (part) => {
       context.fillText(name, 8, y - 24);
       if (!shown) return;
       for (const one of pairs) stad.fillDot(context, [x(one), y + 16], 3.5, "#8a8a8a");
-      stad.strokeLine(context, interval.map((end) => [x(end), y]), "#0072B2", 4); // prettier-ignore
-      stad.fillDot(context, [x(difference), y], 7, "#0072B2");
+      stad.strokeLine(context, interval.map((end) => [x(end), y]), stad.COLORS.blue, 4); // prettier-ignore
+      stad.fillDot(context, [x(difference), y], 7, stad.COLORS.blue);
     });
   }
 
