@@ -21,6 +21,13 @@ FAIL_ONCE = """() => {
         throw new Error("no download")
     }
 }"""
+LOSE = """() => {
+    const load = stad.loadTensors
+    stad.loadTensors = (name) => {
+        stad.loadTensors = load
+        throw new Error(`${name} did not arrive`)
+    }
+}"""
 TILE = 1000 / 200  # points; a track has more tiles
 
 
@@ -80,6 +87,20 @@ def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
     page.wait_for_function("stad.page.log.length === 0")
     evolve(page, done + 1)
     assert page.evaluate(LOG, done + 1) == resumed
+
+
+def test_networks_that_do_not_arrive_leave_the_evolution_as_it_was(evolved):
+    page, done = evolved, evolved.evaluate("stad.page.log.length")
+    page.evaluate(LOSE)
+    page.evaluate("document.querySelector('#live details').open = true")
+    page.select_option("#agent", "input")
+    page.click("#restart")
+    page.click("#restart")  # the first click asks
+    page.wait_for_selector("#live[data-state=failed]")
+    assert "agent=frame" in page.get_attribute("#race", "href")
+    evolve(page, 1)
+    assert page.evaluate("stad.page.log.length") == done + 1
+    assert page.get_attribute("#live", "data-state") == "ready"
 
 
 def test_the_latest_few_evolutions_are_kept_and_a_link_goes_on_with_its_own(opened):

@@ -47,6 +47,9 @@ def test_a_gamepad_begins_a_race_but_holding_it_does_not_end_a_pause(opened):
     page.keyboard.press("p")
     phase(page, "race")
     page.wait_for_function("stad.page.state.action[1] === 0")
+    page.click("#auto")
+    page.evaluate("trigger.value = 0.5")
+    page.wait_for_selector("#auto[aria-pressed=false]")
 
 
 def stays(page, wanted):

@@ -22,7 +22,6 @@ from stad_lab.agent import Agent, rollout, run_folder
 from stad_lab.config import Config, track_seeds
 from stad_lab.envs import physics
 from stad_lab.envs.cars import Cars
-from stad_lab.envs.track import TRACK_WIDTH
 from stad_lab.evaluation.trajectories import encode_trajectory, record_trajectory
 from stad_lab.io.files import load_json
 from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_controller, load_world_model
@@ -108,7 +107,6 @@ def main() -> None:
         "generations": SHOWN,
         "tracks": tracks,
         "every": EVERY,
-        "half_width": TRACK_WIDTH,
         "population": config.evolution.population,
         "episodes": config.evolution.population * config.evolution.tracks,
         "worst": worst,

@@ -70,6 +70,24 @@ stad.projectMap = (points, width, margin = 14) => {
   return { place, scale };
 };
 
+stad.HALF_WIDTH = 20 / 3; // of the road, world units
+
+/** Paint a road as one grey line through its tiles; `place` and `scale` are those of a map. */
+stad.paintRoad = (context, line, place, scale) => {
+  context.lineJoin = "round";
+  stad.strokeLine(context, [...line, line[0]].map(place), "#8a8a8a", 2 * stad.HALF_WIDTH * scale);
+};
+
+/** A recorded road, and the paths on it: each has as many points as `counts` says. */
+stad.readPaths = (tensors, number, counts) => {
+  const [road, all] = ["road", "paths"].map((name) => {
+    const { data } = tensors[`${name}.${number}`];
+    return Array.from({ length: data.length / 2 }, (_, i) => [data[2 * i], data[2 * i + 1]]);
+  });
+  let begin = 0;
+  return [road, counts.map((count) => all.slice(begin, (begin += count)))];
+};
+
 /** The middle of each tile of a track. */
 stad.middleLine = (track) =>
   Array.from({ length: track.count }, (_, i) => [track.path[4 * i + 2], track.path[4 * i + 3]]);

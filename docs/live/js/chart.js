@@ -36,18 +36,17 @@ stad.Chart = class {
     this.x = (value) => left + ((right - left) * value) / axes.xMax;
     this.y = (value) => bottom - ((bottom - top) * Math.min(value, axes.yMax)) / axes.yMax;
 
+    const across = (y, color) => {
+      const line = [left, right].map((x) => [x, this.y(y)]);
+      stad.strokeLine(context, line, color, 1);
+    };
     const text = (words, x, y, align) => {
       context.textAlign = align;
       context.fillText(words, x, y);
     };
     context.fillStyle = ink;
-    context.strokeStyle = faint;
-    context.lineWidth = 1;
     for (const value of ticks(axes.yMax, 3)) {
-      stroke([
-        [left, this.y(value)],
-        [right, this.y(value)],
-      ]);
+      across(value, faint);
       text(String(value), left - 6, this.y(value) + 4, "right");
     }
     const wanted = Math.max(2, Math.floor(width / 90));
@@ -57,35 +56,20 @@ stad.Chart = class {
     text(axes.xLabel, right, height - 4, "right");
 
     for (const { y, text: words } of this.content.levels) {
-      context.strokeStyle = ink;
       context.setLineDash([2, 3]);
-      stroke([
-        [left, this.y(y)],
-        [right, this.y(y)],
-      ]);
+      across(y, ink);
       text(words, right, this.y(y) - 4, "right");
     }
     for (const { points, color, dash = [] } of this.content.lines) {
-      context.strokeStyle = color;
-      context.lineWidth = 2;
       context.setLineDash(dash);
-      stroke(points.map(([x, y]) => [this.x(x), this.y(y)]));
+      stad.strokeLine(context, points.map(([x, y]) => [this.x(x), this.y(y)]), color, 2); // prettier-ignore
     }
     context.setLineDash([]);
     for (const { x, text: words } of this.content.marks) {
-      context.strokeStyle = stad.COLORS.red;
-      stroke([
-        [this.x(x), top],
-        [this.x(x), bottom],
-      ]);
+      const line = [top, bottom].map((y) => [this.x(x), y]);
+      stad.strokeLine(context, line, stad.COLORS.red, 2);
       const early = this.x(x) < (left + right) / 2;
       text(words, this.x(x) + (early ? 5 : -5), top + 10, early ? "left" : "right");
-    }
-
-    function stroke(points) {
-      context.beginPath();
-      for (const [x, y] of points) context.lineTo(x, y);
-      context.stroke();
     }
 
     /** About so many round numbers from 0 to a largest one. */

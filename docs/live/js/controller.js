@@ -41,6 +41,6 @@ stad.expandController = (point, z, h) => {
   return parameters;
 };
 
-/** Load the parameters of a shipped C: "frame", "input", "output" or "input_output". */
-stad.loadController = async (variant) =>
-  (await stad.loadTensors(`controller_${variant}`)).parameters.data;
+/** Load the parameters of a shipped agent's C. */
+stad.loadController = async (agent) =>
+  (await stad.loadTensors(`controller_${agent}`)).parameters.data;

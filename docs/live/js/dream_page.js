@@ -44,7 +44,7 @@ stad.start(async () => {
     if (dream.frames >= LONGEST) return setPlaying(false);
     const now = from + dream.frames;
     if (driver !== "hand" && stad.readGamepad()) setDriver("hand");
-    let action = hand.action;
+    let action;
     if (driver === "hand") action = hand.act();
     else if (driver === "recorded" && now < drive.length) action = drive.action(now);
     else action = stad.control(controller, dream.z, dream.state.h);
@@ -98,9 +98,7 @@ stad.start(async () => {
 
   /** Captions and text alternatives. */
   function tell() {
-    const set = (id, text) => {
-      if (get(id).textContent !== text) get(id).textContent = text;
-    };
+    const set = (id, text) => stad.setText(get(id), text);
     const [steering, gas, brake] = dream ? hand.action : drive.action(t);
     const over = dream && from + dream.frames >= drive.length;
     const names = { agent: "C drives", hand: "you drive", recorded: "recorded actions" };
@@ -108,13 +106,13 @@ stad.start(async () => {
     set("t", `${t}${over ? ", the recording has ended" : ""}`);
     set("dream-name", dream ? "The dream" : encoded?.latents[t] ? "Reconstruction" : "Seen");
     const open = waiting ? "M is processing the episode up to this frame." : "The eyes are open.";
-    set("dream-note", dream ? `${(dream.frames / 50).toFixed(1)} s, ${wheel}` : open);
+    set("dream-note", dream ? `${stad.seconds(dream.frames)} s, ${wheel}` : open);
     set("eyes", dream ? "Open the eyes" : waiting ? "Keep them open" : "Close the eyes here");
     set("scrub-value", String(t));
     set(
       "diverged",
       diverged !== null
-        ? `They diverged after ${diverged} frames (${(diverged / 50).toFixed(1)} s).`
+        ? `They diverged after ${diverged} frames (${stad.seconds(diverged)} s).`
         : dream
           ? over
             ? "The recording ended before they had diverged."
@@ -313,7 +311,12 @@ stad.start(async () => {
     stad.VAE.load(AGENT),
     stad.MDNRNN.load(AGENT),
     stad.loadController(AGENT),
-  ]);
+  ]).catch((error) => {
+    untouched = false; // without networks the eyes stay open
+    cancelWish();
+    setPlaying(false);
+    throw error;
+  });
   encoded = new stad.EncodedEpisode(vae, mdnRnn, drive);
   get("eyes").disabled = false;
   stad.page = {

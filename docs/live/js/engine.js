@@ -6,6 +6,7 @@
 globalThis.stad ??= {};
 
 stad.FRAMES_A_SECOND = 50;
+stad.seconds = (frames, digits = 1) => (frames / stad.FRAMES_A_SECOND).toFixed(digits);
 stad.LONGEST = 1000; // frames of an episode
 
 {

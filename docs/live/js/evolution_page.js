@@ -20,22 +20,13 @@ stad.start(async () => {
   // The track
 
   const tracks = run.tracks.map((facts, number) => {
-    const paths = pairs(tensors[`paths.${number}`].data);
-    let begin = 0;
-    return {
-      ...facts,
-      road: pairs(tensors[`road.${number}`].data),
-      paths: facts.points.map((count) => paths.slice(begin, (begin += count))),
-    };
+    const [road, paths] = stad.readPaths(tensors, number, facts.points);
+    return { ...facts, road, paths };
   });
   const MARGIN = 0.06; // of the map, share of its width
   let moment = 0; // of the dot, in points of the path
 
-  function pairs(data) {
-    return Array.from({ length: data.length / 2 }, (_, i) => [data[2 * i], data[2 * i + 1]]);
-  }
-
-  let background = null; // the road and all paths, painted once for a size, track and theme
+  let background = null; // the road and all paths, painted once for a size and track
 
   function drawTrack() {
     const canvas = stad.get("track");
@@ -44,7 +35,7 @@ stad.start(async () => {
     const { context, width } = cleared;
     const track = tracks[which];
     const { place } = stad.projectMap(track.road, width, MARGIN * width);
-    const key = [which, canvas.width, stad.color("--color-background-primary")].join();
+    const key = [which, canvas.width].join();
     if (background?.key !== key) background = { key, picture: paintBackground(canvas, width) };
     context.drawImage(background.picture, 0, 0, width, width);
     const path = track.paths[chosen];
@@ -61,12 +52,10 @@ stad.start(async () => {
     context.scale(canvas.width / width, canvas.width / width);
     const track = tracks[which];
     const { place, scale } = stad.projectMap(track.road, width, MARGIN * width);
-    context.lineJoin = "round";
-    const road = [...track.road, track.road[0]].map(place);
-    stad.strokeLine(context, road, "#8a8a8a", 2 * run.half_width * scale);
+    stad.paintRoad(context, track.road, place, scale);
     for (const path of track.paths)
       stad.strokeLine(context, path.map(place), "rgba(0, 114, 178, 0.22)", 1);
-    stad.fillDot(context, road[0], 4, "white");
+    stad.fillDot(context, place(track.road[0]), 4, "white");
     return picture;
   }
 
@@ -104,7 +93,7 @@ stad.start(async () => {
 
   function drawDream() {
     stad.paintFrame(stad.get("dream"), vae.decode(dream.z).frame);
-    const seconds = (dream.frames / 50).toFixed(1);
+    const seconds = stad.seconds(dream.frames);
     stad.get("dream-text").textContent = `generation ${generations[chosen]}, ${seconds} s`;
     stad.describe(
       stad.get("dream"),
@@ -139,7 +128,7 @@ stad.start(async () => {
     stad.get("generation-value").textContent = generation;
     slider.setAttribute("aria-valuetext", `generation ${generation}`);
     const [points, frames] = [track.returns[chosen], track.frames[chosen]];
-    const seconds = (frames / 50).toFixed(0);
+    const seconds = stad.seconds(frames, 0);
     const end = track.laps[chosen]
       ? `a complete lap in ${seconds} seconds`
       : frames < 1000
@@ -172,11 +161,15 @@ stad.start(async () => {
     drawTrack();
   }
 
+  /** The dot goes to the start; who wants no motion sees the whole path at once. */
+  function rewind() {
+    moment = stad.prefersStill() ? Infinity : 0;
+  }
+
   let timer = 0;
   function choose(number) {
     chosen = Math.min(last, Math.max(0, number));
-    moment = 0;
-    if (stad.prefersStill()) moment = Infinity; // the whole path at once
+    rewind();
     beginDream();
     show();
   }
@@ -198,7 +191,7 @@ stad.start(async () => {
   });
   stad.get("which").addEventListener("change", (event) => {
     which = Number(event.target.value);
-    moment = 0;
+    rewind();
     show();
   });
   stad.get("play").addEventListener("click", () => {
@@ -211,7 +204,6 @@ stad.start(async () => {
   stad.get("dream-play").addEventListener("click", () => setDream(!clock.running));
   stad.get("dream-again").addEventListener("click", nextDream);
   new ResizeObserver(drawTrack).observe(stad.get("track"));
-  stad.onTheme(drawTrack);
   choose(generations.indexOf(5));
   setDream(!stad.prefersStill());
 });

@@ -3,7 +3,6 @@
 globalThis.stad ??= {};
 
 {
-  const HALF_WIDTH = 20 / 3; // of the road, world units
   const { orange, green, blue } = stad.COLORS;
   const STOPPED = "#8c8c8c";
   const [CAR, BEST] = [6, 10]; // pixels, lengths of cars
@@ -13,7 +12,6 @@ globalThis.stad ??= {};
     constructor(canvas) {
       [this.canvas, this.cars, this.track, this.layer] = [canvas, [], null, null];
       new ResizeObserver(() => this.draw()).observe(canvas);
-      stad.onTheme(() => this.draw());
     }
 
     /** A track from the engine, and so many cars at its start; the last one is the mean's. */
@@ -46,8 +44,7 @@ globalThis.stad ??= {};
       const cleared = stad.clearCanvas(this.canvas);
       if (!cleared || !this.track) return;
       const { context, width } = cleared;
-      const key = [this.canvas.width, stad.color("--color-background-primary")].join();
-      if (this.layer?.key !== key) this.paint(key, width);
+      if (this.layer?.picture.width !== this.canvas.width) this.paint(width);
       context.drawImage(this.layer.picture, 0, 0, width, width);
       const [mean, best] = [this.cars.at(-1), this.best];
       for (const car of this.cars)
@@ -63,18 +60,16 @@ globalThis.stad ??= {};
     }
 
     /** The road and the paths so far, on a canvas of their own: only new pieces are added to it. */
-    paint(key, width) {
+    paint(width) {
       const picture = document.createElement("canvas");
       [picture.width, picture.height] = [this.canvas.width, this.canvas.width];
       const context = picture.getContext("2d");
       context.scale(picture.width / width, picture.width / width);
       const { line } = this.track;
       const { place, scale } = stad.projectMap(line, width, 0.06 * width);
-      context.lineJoin = "round";
-      const road = [...line, line[0]].map(place);
-      stad.strokeLine(context, road, "#8a8a8a", 2 * HALF_WIDTH * scale);
-      stad.fillDot(context, road[0], 4, "white");
-      this.layer = { key, picture, context, place };
+      stad.paintRoad(context, line, place, scale);
+      stad.fillDot(context, place(line[0]), 4, "white");
+      this.layer = { picture, context, place };
       for (const car of this.cars) this.extend(car, car.path.length);
     }
 

@@ -24,7 +24,7 @@ stad.start(async () => {
 
   async function drive() {
     const own = run;
-    await beginning;
+    await beginning.catch(() => {}); // after one that failed the earlier evolution goes on
     while (wanted > 0 && own === run) {
       wanted -= 1;
       await generation(own);
@@ -67,12 +67,21 @@ stad.start(async () => {
 
   /** Begin an evolution afresh, or go on with a kept log. */
   async function begin(chosen, kept = []) {
-    const [own, before] = [++run, driving];
+    const [own, before, earlier] = [++run, driving, settings];
     [settings, wanted, paused] = [chosen, 0, null];
     await crew.stop();
     await before;
+    let loaded;
+    try {
+      loaded = await loadNetworks(chosen);
+    } catch (error) {
+      if (own !== run) return; // another start has overtaken this one
+      settings = earlier;
+      throw Object.assign(error, { loading: true });
+    }
     if (own !== run) return;
-    await chooseNetworks();
+    identity = loaded.identity;
+    await crew.callAll("choose", loaded.networks);
     const inputs = INPUTS[settings.sees];
     const found = await crew.lead("evolve", { settings, inputs, log: kept });
     const next = await crew.lead("ask");
@@ -99,23 +108,22 @@ stad.start(async () => {
       await restart(first, kept?.log);
       get("answer").textContent ||= stad.evolveSettings.ignored(address);
     } catch (error) {
+      if (error.loading) throw error; // what was kept is as good as before
       await restart(first);
       get("answer").textContent = error.message;
     }
   }
 
-  /** Give the workers V and, if C sees its memory, M. */
-  async function chooseNetworks() {
-    const { agent, sees } = settings;
+  /** V and, if C sees its memory, M for the workers; and which they are, for the file. */
+  async function loadNetworks({ agent, sees }) {
     const [vae, mdnRnn, c] = await Promise.all([
       stad.loadTensors(`vae_${agent}`),
       sees === "z" ? null : stad.loadTensors(`mdn_rnn_${agent}`),
       stad.load(`controller_${agent}`),
     ]);
-    const networks = { vae, mdnRnn };
-    await crew.callAll("choose", { ...networks, cropBar: agent.startsWith("cropped") });
+    const networks = { vae, mdnRnn, cropBar: agent.startsWith("cropped") };
     const { variant, vae: v, mdn_rnn: m } = stad.readMetadata(await stad.decodeBase64(c));
-    identity = { variant, vae: v, mdn_rnn: m };
+    return { networks, identity: { variant, vae: v, mdn_rnn: m } };
   }
 
   // --- Pictures, words and buttons ----------------------------------------------------------------
@@ -124,6 +132,7 @@ stad.start(async () => {
     const inputs = INPUTS[settings.sees];
     view.show({ log, states, finished, bet, settings, inputs });
     showButtons();
+    if (get("live").dataset.state === "failed") stad.recover();
   }
 
   function showButtons() {

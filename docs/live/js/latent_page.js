@@ -14,7 +14,7 @@ stad.start(async () => {
 
   // The first slider moves by itself until the reader takes over.
   let phase = 0;
-  const wave = new stad.Clock(() => (phase += 1 / 50), drawWave, 50);
+  const wave = new stad.Clock(() => (phase += 1 / 50), drawWave);
 
   function drawWave() {
     const [first] = order();
@@ -44,14 +44,17 @@ stad.start(async () => {
       loaded = await vaes.get(name);
     } catch (error) {
       vaes.delete(name);
+      if (mine !== choice) return;
       throw error;
     }
     if (mine !== choice) return; // the reader has chosen another one meanwhile
     [variant, vae] = [name, loaded];
     buildSliders();
     await stad.pause();
-    if (mine === choice) encode();
+    if (mine !== choice) return;
+    encode();
     stad.announce(`V is now ${name}.`);
+    stad.recover();
   }
 
   function buildSliders() {
@@ -193,7 +196,7 @@ stad.start(async () => {
     const bound = (value) => Math.min(REACH, Math.max(-REACH, value));
     stopWave();
     set(axes[0], bound(across));
-    if (axes[1] !== axes[0]) set(axes[1], bound(up));
+    set(axes[1], bound(up));
     show();
     stad.announce(`z[${axes[0]}] ${z[axes[0]].toFixed(2)}, z[${axes[1]}] ${z[axes[1]].toFixed(2)}`);
   }

@@ -118,9 +118,9 @@ stad.MDNRNN = class {
     return new stad.Mixture(output, latentSize, mixtures);
   }
 
-  /** Load a shipped M: "frame", "input", "output" or "input_output". */
-  static async load(variant) {
-    const parts = [stad.loadEngine(), stad.loadTensors(`mdn_rnn_${variant}`)];
+  /** Load M of a shipped agent. */
+  static async load(agent) {
+    const parts = [stad.loadEngine(), stad.loadTensors(`mdn_rnn_${agent}`)];
     return new stad.MDNRNN(...(await Promise.all(parts)));
   }
 };

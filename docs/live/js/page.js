@@ -5,6 +5,11 @@ globalThis.stad ??= {};
 /** The element with an id. */
 stad.get = (id) => document.getElementById(id);
 
+/** Set a text only if it changes, so that a screen reader hears it once. */
+stad.setText = (element, text) => {
+  if (element.textContent !== text) element.textContent = text;
+};
+
 /** Colours that the colour-blind tell apart. */
 stad.COLORS = {
   blue: "#0072B2",
@@ -24,6 +29,8 @@ stad.COLORS = {
    * @param {() => Promise<void>} main
    */
   stad.start = async (main) => {
+    stad.forget(stad.get("live"));
+    stad.quieten(stad.get("live"));
     const controls = enclose();
     try {
       await main();
@@ -36,8 +43,6 @@ stad.COLORS = {
 
   /** Put all of the page into a fieldset, which takes no input yet. */
   function enclose() {
-    stad.forget(stad.get("live"));
-    stad.quieten(stad.get("live"));
     const fieldset = document.createElement("fieldset");
     fieldset.setAttribute("role", "presentation");
     fieldset.disabled = fieldset.inert = true;
@@ -137,11 +142,17 @@ stad.Clock = class {
     if (this.running) return;
     this.running = true;
     this.due = performance.now();
-    requestAnimationFrame((now) => this.tick(now));
+    this.wait();
   }
 
   pause() {
     this.running = false;
+  }
+
+  /** Ask for the next frame of the screen, once. */
+  wait() {
+    cancelAnimationFrame(this.request);
+    this.request = requestAnimationFrame((now) => this.tick(now));
   }
 
   tick(now) {
@@ -156,7 +167,7 @@ stad.Clock = class {
       stepped = true;
     }
     if (stepped) this.draw();
-    requestAnimationFrame((next) => this.tick(next));
+    if (this.running) this.wait();
   }
 };
 

@@ -122,7 +122,7 @@
     order.forEach((i, rank) => {
       const place = toPixels(sample[i], width);
       stad.fillDot(context, place, 4, "#222");
-      stad.fillDot(context, place, 3, rank < better ? "#56B4E9" : "#bbbbbb");
+      stad.fillDot(context, place, 3, rank < better ? stad.COLORS.sky : "#bbbbbb");
     });
     const { long, short, angle } = strategy.ellipse();
     const [x, y] = toPixels(strategy.mean, width);

@@ -42,16 +42,20 @@ stad.start(async () => {
     worker.postMessage({ type: "choose", networks });
   }
 
-  let missing = false; // whether the files of the last rival did not arrive
+  let wishes = 0; // rivals that were wished for
+  let missing = false; // whether the files of the last one did not arrive
 
   /** Let the chosen rival drive. */
   async function change() {
+    const own = ++wishes;
     try {
       await choose(agent);
+      if (own !== wishes) return; // another one was chosen meanwhile
       if (missing) stad.recover();
       missing = false;
       if (state?.phase === "attract") showStart(); // with the rival's name
     } catch (error) {
+      if (own !== wishes) return;
       missing = true;
       stad.fail(error);
     }
@@ -74,7 +78,7 @@ stad.start(async () => {
   function draw() {
     requestAnimationFrame(draw);
     if (!state || !track || document.hidden || !seen) return;
-    const share = Math.min(1, (performance.now() - arrived) / 20);
+    const share = Math.min(1, ((performance.now() - arrived) * stad.FRAMES_A_SECOND) / 1000);
     const pose = (name) => stad.poseBetween(before?.[name].pose, state[name].pose, share);
     const racing = state.phase === "race";
     const told = autopilot()
@@ -101,10 +105,7 @@ stad.start(async () => {
 
   // --- Words --------------------------------------------------------------------------------------
 
-  const seconds = (frames) => (frames / stad.FRAMES_A_SECOND).toFixed(1);
-  const set = (id, text) => {
-    if (get(id).textContent !== text) get(id).textContent = text;
-  };
+  const set = (id, text) => stad.setText(get(id), text);
 
   function tell() {
     const { you, rival, phase } = state;
@@ -112,7 +113,7 @@ stad.start(async () => {
     set("your-score", mine);
     set("rival-score", rival.score.toFixed(0));
     const time = phase === "attract" ? rival.frames : you.frames;
-    set("time", `${seconds(time)} s`);
+    set("time", `${stad.seconds(time)} s`);
     const driven = Math.round(100 * you.tiles);
     const name = driver ? "evolved driver" : `agent ${agent}`;
     const text = {
@@ -180,7 +181,7 @@ stad.start(async () => {
     const title = helped ? "The autopilot has driven" : won;
     const ways = ["The time is up", "A complete lap", "You left the field"];
     const text =
-      `${ways[you.ending]} after ${seconds(you.frames)} s: ${mine.toFixed(1)} points. ` +
+      `${ways[you.ending]} after ${stad.seconds(you.frames)} s: ${mine.toFixed(1)} points. ` +
       `The agent has ${its.toFixed(1)}. ${recordOf(mine, helped)}`;
     showCard(title, text);
     stad.announce(`${title} ${text} ${get("card-way").textContent}`);
@@ -248,10 +249,8 @@ stad.start(async () => {
     if (state?.phase !== "race") return;
     asleep = !asleep;
     if (asleep) sleptAt = state.you.frames;
-    worker.postMessage({ type: "eyes", closed: asleep });
-    get("dream").hidden = !asleep;
-    set("eyes", asleep ? "Open the eyes" : "Close the eyes");
-    const slept = seconds(state.you.frames - (sleptAt ?? 0));
+    setEyes();
+    const slept = stad.seconds(state.you.frames - sleptAt);
     stad.announce(asleep ? "The eyes are closed: you see the dream." : `Awake after ${slept} s.`);
   }
 
@@ -266,9 +265,13 @@ stad.start(async () => {
   function wake() {
     if (!asleep) return;
     asleep = false;
-    worker.postMessage({ type: "eyes", closed: false });
-    get("dream").hidden = true;
-    set("eyes", "Close the eyes");
+    setEyes();
+  }
+
+  function setEyes() {
+    worker.postMessage({ type: "eyes", closed: asleep });
+    get("dream").hidden = !asleep;
+    set("eyes", asleep ? "Open the eyes" : "Close the eyes");
   }
 
   function setPaused(paused) {
@@ -388,7 +391,7 @@ stad.start(async () => {
     if (asked.seed !== seed) drive(asked.seed);
   }
 
-  /** The left and the right half of the picture steer, also of a finger that slides. */
+  /** A finger steers to its half of the picture, also while it slides. */
   function steer(event) {
     const { left, width } = get("race").getBoundingClientRect();
     const place = (event.clientX - left) / width - 0.5;
@@ -413,6 +416,7 @@ stad.start(async () => {
       race.addEventListener(end, ({ pointerId }) => held.delete(pointerId) && sendPedals());
     const press = (down) => (event) => {
       event.preventDefault();
+      if (down && autopilot()) setAuto(false);
       if (down) held.set("brake", "brake");
       else held.delete("brake");
       sendPedals();
@@ -428,7 +432,11 @@ stad.start(async () => {
     setInterval(() => {
       const [was, now] = [gripped, stad.readGamepad() !== null];
       gripped = now;
-      if (now && !was && seen) wish(); // not while it is held: the reader may have paused since
+      if (now && !was && seen) {
+        // not while it is held: the reader may have paused since
+        if (autopilot()) setAuto(false);
+        wish();
+      }
       if (now || was) sendPedals();
     }, 40);
   }
@@ -457,6 +465,8 @@ stad.start(async () => {
       ({ driver, agent } = chosen);
       writeAddress();
       change();
+      // After a mouse the up arrow is to begin a race, not to choose another rival.
+      if (!target.matches(":focus-visible")) get("seat").focus({ preventScroll: true });
     });
     get("share").addEventListener("click", share);
   }
@@ -472,8 +482,11 @@ stad.start(async () => {
     }
   }
 
-  const listeners = [listenToKeys, listenToWindow, listenToTouch, listenToGamepad];
-  for (const listen of [...listeners, listenToControls]) listen();
+  listenToKeys();
+  listenToWindow();
+  listenToControls(); // before the touch, which needs to know that a finger drives
+  listenToTouch();
+  listenToGamepad();
 
   await choose(agent);
   drive(seed);

@@ -4,14 +4,13 @@ globalThis.stad ??= {};
 
 {
   const { orange: ORANGE, blue: BLUE } = stad.COLORS;
-  // World units: half the field, the height of the picture, and half the road's width.
-  const [FIELD, VIEW, HALF_WIDTH] = [333, 62, 6.67];
+  const [FIELD, VIEW] = [333, 62]; // world units: half the field, and the height of the picture
   const LOW = 0.72; // where the car is: this share of the height from above
   const PIECE = 20; // tiles
   const LARGE = "600 17px system-ui, sans-serif";
 
   /** The track with its road in pieces, each as one path for each shade, and as a line for the map. */
-  stad.prepareRoad = (found) => {
+  stad.prepareRoad = (track) => {
     const polygon = (path, corners, i) => {
       path.moveTo(corners[8 * i], corners[8 * i + 1]);
       for (let k = 1; k < 4; k++) path.lineTo(corners[8 * i + 2 * k], corners[8 * i + 2 * k + 1]);
@@ -19,23 +18,23 @@ globalThis.stad ??= {};
     };
     const colors = ["#666", "#696969", "#6b6b6b", "#fff", "#e8342c"]; // the last two are kerbs
     const pieces = [];
-    for (let first = 0; first < found.count; first += PIECE) {
-      const middle = 4 * Math.min(first + PIECE / 2, found.count - 1);
+    for (let first = 0; first < track.count; first += PIECE) {
+      const middle = 4 * Math.min(first + PIECE / 2, track.count - 1);
       const layers = colors.map((color) => ({ color, path: new Path2D() }));
-      pieces.push({ x: found.path[middle + 2], y: found.path[middle + 3], layers });
+      pieces.push({ x: track.path[middle + 2], y: track.path[middle + 3], layers });
     }
     const layersOf = (tile) => pieces[Math.floor(tile / PIECE)].layers;
-    for (let i = 0; i < found.count; i++) polygon(layersOf(i)[i % 3].path, found.tiles, i);
-    found.kerbTiles.forEach((tile, i) =>
-      polygon(layersOf(tile)[3 + (tile % 2)].path, found.kerbs, i),
+    for (let i = 0; i < track.count; i++) polygon(layersOf(i)[i % 3].path, track.tiles, i);
+    track.kerbTiles.forEach((tile, i) =>
+      polygon(layersOf(tile)[3 + (tile % 2)].path, track.kerbs, i),
     );
-    const line = stad.middleLine(found);
+    const line = stad.middleLine(track);
     const [xs, ys] = [line.map(([x]) => x), line.map(([, y]) => y)];
     const box = [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
-    return { ...found, pieces, line, box };
+    return { ...track, pieces, line, box };
   };
 
-  /** A pose between those after two steps, so that the picture moves at the screen's rate. */
+  /** A pose between the last two, so that the picture moves at the screen's rate. */
   stad.poseBetween = (was, now, share) => {
     if (!was || Math.hypot(now.x - was.x, now.y - was.y) > 10) return now; // a new episode
     const mix = (a, b) => a + (b - a) * share;
@@ -157,7 +156,7 @@ globalThis.stad ??= {};
   /** An arrow to the road, for a car that has left it. */
   function drawWayBack({ context, width, height }, line, { x, y, angle }, told) {
     const { tile, distance } = stad.nearest(line, [x, y]);
-    if (distance < 2 * HALF_WIDTH) return;
+    if (distance < 2 * stad.HALF_WIDTH) return;
     const [a, b] = line[tile];
     const scale = height / VIEW;
     context.save();
@@ -173,7 +172,7 @@ globalThis.stad ??= {};
     context.fillStyle = "#fff";
     context.font = LARGE;
     context.textAlign = "center";
-    context.fillText(told, width / 2, 0.2 * height);
+    context.fillText(told, width / 2, 0.24 * height);
   }
 
   function drawMap({ context, width, height }, { line, box }, cars) {
@@ -225,6 +224,7 @@ globalThis.stad ??= {};
   /** What a finger does, until it has done it. */
   function drawHint(context, width, height) {
     context.font = LARGE;
+    context.textAlign = "center";
     context.fillStyle = "#000b";
     context.beginPath();
     context.roundRect(width / 2 - 130, 0.28 * height - 25, 260, 62, 10);

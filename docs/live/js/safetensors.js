@@ -127,6 +127,7 @@ stad.data ??= {};
       const [module, rest] = await Promise.all([code, tables].map(stad.unpack));
       return stad.Engine.make(module, facts, rest);
     })();
+    engine.catch(() => (engine = null)); // another attempt may succeed
     return engine;
   };
 }

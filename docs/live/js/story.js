@@ -95,11 +95,11 @@ globalThis.stad ??= {};
 
   /** A shipped agent in this page's own thread; its V and M are loaded once. */
   stad.loadDriver = async (name) => {
-    if (!drivers.has(name))
-      drivers.set(
-        name,
-        Promise.all([stad.VAE.load(name), stad.MDNRNN.load(name), stad.loadController(name)]),
-      );
+    if (!drivers.has(name)) {
+      const parts = [stad.VAE.load(name), stad.MDNRNN.load(name), stad.loadController(name)];
+      drivers.set(name, Promise.all(parts));
+      drivers.get(name).catch(() => drivers.delete(name)); // another attempt may succeed
+    }
     const [vae, mdnRnn, parameters] = await drivers.get(name);
     return new stad.Agent(vae, mdnRnn, Float64Array.from(parameters));
   };

@@ -8,11 +8,7 @@ stad.figure("breed", async (part) => {
   ]);
   const { generations } = run;
   const [facts] = run.tracks;
-  const pairs = (data) =>
-    Array.from({ length: data.length / 2 }, (_, i) => [data[2 * i], data[2 * i + 1]]);
-  const [all, road] = [pairs(tensors["paths.0"].data), pairs(tensors["road.0"].data)];
-  let begin = 0;
-  const paths = facts.points.map((count) => all.slice(begin, (begin += count)));
+  const [road, paths] = stad.readPaths(tensors, 0, facts.points);
   const first = facts.laps.indexOf(true);
   let [moment, planted, wanted] = [0, false, !stad.prefersStill()];
   const STEPS = 5; // frames between two points of a path
@@ -32,8 +28,7 @@ stad.figure("breed", async (part) => {
     if (!cleared) return;
     const { context, width } = cleared;
     const { place, scale } = stad.projectMap(road, width);
-    context.lineJoin = "round";
-    stad.strokeLine(context, [...road, road[0]].map(place), "#8a8a8a", 2 * run.half_width * scale);
+    stad.paintRoad(context, road, place, scale);
     const at = (i) => paths[i][Math.min(moment, paths[i].length - 1)];
     for (let i = 0; i < paths.length; i++)
       if (i !== chosen()) stad.fillDot(context, place(at(i)), 3.5, shade(i));

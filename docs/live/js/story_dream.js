@@ -9,7 +9,6 @@
   const ROWS = 54; // above the indicator bar
 
   const isRoad = (frame, p) => frame[p + 1] - frame[p] < 0.18; // grass is green
-  const inSeconds = (frames) => (frames / stad.FRAMES_A_SECOND).toFixed(1);
 
   /** How much two pictures disagree on where the road is: a share of their pixels. */
   function disagreement(first, second) {
@@ -104,11 +103,9 @@
         else one.apart ??= now; // a slow device draws fewer frames than it dreams
         if (one.apart !== null && now - one.apart >= LASTING - 1) one.diverged = one.apart;
       });
-      const told = dreams.map(({ diverged }) => (diverged === null ? "still together" : `diverged after ${inSeconds(diverged)} s`)); // prettier-ignore
-      told.forEach((text, i) => {
-        if (part(`told-${i + 1}`).textContent !== text) part(`told-${i + 1}`).textContent = text;
-      });
-      const time = inSeconds(dreams[0].dream.frames);
+      const told = dreams.map(({ diverged }) => (diverged === null ? "still together" : `diverged after ${stad.seconds(diverged)} s`)); // prettier-ignore
+      told.forEach((text, i) => stad.setText(part(`told-${i + 1}`), text));
+      const time = stad.seconds(dreams[0].dream.frames);
       part("time").textContent = `${time} s with closed eyes`;
       stad.describe(part("real"), `the real road, ${time} seconds after the eyes closed`);
       canvases.forEach((canvas, i) => stad.describe(canvas, `dream ${i + 1}, ${told[i]}`));
@@ -122,8 +119,8 @@
       const answer = BOUNDS.filter((bound) => middle > bound).length;
       const told =
         middle < Infinity
-          ? `the middle one of the three diverged after ${inSeconds(middle)} seconds.`
-          : `two of the three were still together after ${inSeconds(dreams[0].dream.frames)} seconds, when they ended.`; // prettier-ignore
+          ? `the middle one of the three diverged after ${stad.seconds(middle)} seconds.`
+          : `two of the three were still together after ${stad.seconds(dreams[0].dream.frames)} seconds, when they ended.`; // prettier-ignore
       const text = `${bet.choice === answer ? "Right" : "No"}: ${told}`;
       part("answer").textContent = text;
       stad.announce(text);
@@ -222,7 +219,7 @@
 
     /** Seconds on the road, at the car's own pace. */
     function lasted() {
-      return inSeconds(Math.max(0, dream.frames - off - (who === "you" ? TAKE_OVER : 0)));
+      return stad.seconds(Math.max(0, dream.frames - off - (who === "you" ? TAKE_OVER : 0)));
     }
 
     /** Whether some road lies just beside the car, which is drawn at the bottom middle. */

@@ -6,7 +6,6 @@ stad.figure("hairpin", async (part) => {
   const [agent, engine] = await Promise.all([stad.loadDriver(NAME), stad.loadEngine()]);
   const [track, car] = [engine.makeTrack(TRACK), engine.makeCar()];
   const line = stad.middleLine(track);
-  const HALF_WIDTH = 20 / 3; // of the road, world units
   let [mark, path, lost, over, begun] = [null, [], [], false, false];
   let wanted = false; // whether the reader wants the car to drive
   car.reset(track);
@@ -21,7 +20,7 @@ stad.figure("hairpin", async (part) => {
       const at = [x, y];
       const { tile, distance } = stad.nearest(line, at);
       path.push(at);
-      if (distance > 1.5 * HALF_WIDTH) lost.push({ tile, frame: car.frames, at });
+      if (distance > 1.5 * stad.HALF_WIDTH) lost.push({ tile, frame: car.frames, at });
     }
     if (car.over) finish();
   }
@@ -34,7 +33,7 @@ stad.figure("hairpin", async (part) => {
     const near = Math.min(apart, track.count - apart) < 20;
     const text = tile === undefined
       ? `It stayed on the road, with ${car.score.toFixed(0)} points.`
-      : `${near ? "You found it" : "Elsewhere"}: the car first left the road after ${(lost[0].frame / 50).toFixed(1)} seconds, at the first red dot. ${car.score.toFixed(0)} points.`; // prettier-ignore
+      : `${near ? "You found it" : "Elsewhere"}: the car first left the road after ${stad.seconds(lost[0].frame)} seconds, at the first red dot. ${car.score.toFixed(0)} points.`; // prettier-ignore
     part("answer").textContent = text;
     stad.announce(text);
     part("race").hidden = false;
@@ -47,9 +46,8 @@ stad.figure("hairpin", async (part) => {
     if (!cleared) return;
     const { context, width } = cleared;
     const { place, scale } = stad.projectMap(line, width);
-    context.lineJoin = "round";
-    stad.strokeLine(context, [...line, line[0]].map(place), "#8a8a8a", 2 * HALF_WIDTH * scale);
-    stad.strokeLine(context, line.slice(0, 2).map(place), "white", 2 * HALF_WIDTH * scale);
+    stad.paintRoad(context, line, place, scale);
+    stad.strokeLine(context, line.slice(0, 2).map(place), "white", 2 * stad.HALF_WIDTH * scale);
     stad.strokeLine(context, path.map(place), stad.COLORS.blue, 2);
     for (const { at } of lost) stad.fillDot(context, place(at), 3, stad.COLORS.red);
     if (mark !== null) {

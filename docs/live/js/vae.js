@@ -94,9 +94,9 @@ stad.VAE = class {
     return { frame, difference };
   }
 
-  /** Load a shipped V: "frame", "input", "output" or "input_output". */
-  static async load(variant) {
-    const parts = [stad.loadEngine(), stad.loadTensors(`vae_${variant}`)];
+  /** Load V of a shipped agent. */
+  static async load(agent) {
+    const parts = [stad.loadEngine(), stad.loadTensors(`vae_${agent}`)];
     return new stad.VAE(...(await Promise.all(parts)));
   }
 };
