@@ -151,7 +151,7 @@ def cause(claims: dict) -> str:
 
 
 def cause_table(study: dict) -> str:
-    """The comparisons of study 5; those without a p-value are described only."""
+    """The comparisons of study 5; those without a p-value are not tested."""
     lines = []
     for name, title in CAUSE.items():
         if name in study["comparisons"]:
@@ -159,7 +159,7 @@ def cause_table(study: dict) -> str:
             low, high = one["t_interval"]
             cells = (title, difference_of(one), f"{low:.1f} to {high:.1f}")
             tests = [p_value(one[key]) for key in ("p", "holm_p") if key in one] or ["", ""]
-            outcome = verdict_of(one) if "verdict" in one else "described"
+            outcome = verdict_of(one) if "verdict" in one else "not tested"
             if outcome in ("gain", "harm") and max(map(abs, one["interval"])) < MARGIN:
                 outcome += f", of fewer than {MARGIN} points"
             lines.append((*cells, *tests, outcome))

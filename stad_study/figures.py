@@ -24,7 +24,7 @@ SOURCES = {"z": "z", "z, h": "z and h"}
 CAUSE = {  # the comparisons of study 5, in Markdown
     "effect with z": "`input_output` - `frame`, C sees z",
     "effect with z and h": "`input_output` - `frame`, C sees z and h",
-    "interaction": "`input_output` - `frame`: with z, minus the same with z and h",
+    "interaction": "`input_output` - `frame`: interaction, row 1 minus row 2",
     "input_output less input": "`input_output` - `input`, mean of both C",
     "adding motion": "`frame`: z + motion, minus z + placebo",
     "erasing motion": "`input_output`: z - motion, minus z - placebo",
@@ -107,11 +107,11 @@ def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
     draw_margin(axis, margin)
     for height, (title, one) in enumerate(rows.items()):
         plot_comparison(axis, height, one, COLOURS[title.split()[0].rstrip(":")])
-    name_rows(axis, [title.replace(", minus", ",\nminus") for title in rows])
+    name_rows(axis, [title.replace(": ", ":\n") for title in rows])
     axis.set_xlabel("difference, points")
     legend_below(figure, axis)
     told = [f"{title} {difference_of(one)}" for title, one in rows.items()]
-    return describe(figure, "Study 5: each C evolved three times", "Means: ", ["; ".join(told)])
+    return describe(figure, "Study 5: a score is the mean of three C", "Means: ", ["; ".join(told)])
 
 
 def plot_cause_curves(arms: dict[str, dict], every: int) -> Figure:

@@ -190,15 +190,15 @@ def plot_histograms(shares: dict[str, np.ndarray], title: str, xlabel: str) -> F
 def plot_evolution(curves: np.ndarray, validation: dict[int, float], title: str) -> Figure:
     """Worst, average and best fitness of each generation: (3, generations), of `fitness_curves`.
 
-    `validation`: generation -> score of C on the validation tracks.
+    `validation`: generation -> score of the mean driver (C) on the validation tracks.
     """
     figure, ((axis,),) = new_figure(7.0, 3.8)
     generation = np.arange(1, curves.shape[1] + 1)
     names = ("worst", "average", "best")
-    for values, name, color in zip(curves, names, (RED, BLUE, GREEN), strict=True):
+    for values, name, color in zip(curves, names, ("#8c8c8c", BLUE, ORANGE), strict=True):
         axis.plot(generation, values, color=color, lw=1.3, label=f"{name} candidate")
     if validation:
-        style = {"color": "black", "ms": 4, "label": "C, validation tracks"}
+        style = {"color": GREEN, "ms": 4, "label": "mean driver, validation tracks"}
         axis.plot(list(validation), list(validation.values()), "o--", **style)
     axis.axhline(SOLVED, **THIN, label=f"{SOLVED} points")
     axis.set(xlabel="generation", ylabel="fitness: mean return over the tracks")
@@ -254,8 +254,8 @@ def plot_returns(returns: dict[str, np.ndarray], title: str, paired: bool = Fals
     for row, (values, (color, _)) in enumerate(styles):
         mean, spread = values.mean(), 0.22 * (not paired)
         heights = row + rng.uniform(-spread, spread, len(values))
+        axis.plot([mean] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5, zorder=1)
         axis.scatter(values, heights, 12, color, alpha=0.6)
-        axis.plot([mean] * 2, [row - 0.35, row + 0.35], color="black", lw=2.5)
         axis.text(1.01, row, f"mean {mean:.0f}", transform=axis.get_yaxis_transform(), **text)
     axis.set_xlabel("return of an episode")
     name_rows(axis, returns)
