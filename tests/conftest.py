@@ -100,12 +100,16 @@ def command_line():
     return run_stad_lab
 
 
+def shared_folder(tmp_path_factory, worker_id):
+    """A folder that all processes of this test run share."""
+    own = tmp_path_factory.getbasetemp()
+    return own if worker_id == "master" else own.parent
+
+
 @pytest.fixture(scope="session")
 def quick_training(tmp_path_factory, worker_id):
     """One run made by the real command: (its folder, the finished process, seconds)."""
-    shared = tmp_path_factory.getbasetemp()
-    if worker_id != "master":
-        shared = shared.parent  # all processes of this test run share the run
+    shared = shared_folder(tmp_path_factory, worker_id)
     told = shared / "quick_training.json"
     with FileLock(shared / "quick_training.lock"):
         if not told.exists():
@@ -260,12 +264,21 @@ def interrupt_after():
 
 
 @pytest.fixture(scope="session")
-def live_pages(tmp_path_factory):
+def live_pages(tmp_path_factory, worker_id):
     """A folder with the live pages as plain HTML, and all their scripts."""
+    shared = shared_folder(tmp_path_factory, worker_id)
+    with FileLock(shared / "live.lock"):
+        if not (shared / "live").exists():
+            write_live_pages(shared / "live.part")
+            (shared / "live.part").rename(shared / "live")
+    return shared / "live"
+
+
+def write_live_pages(folder):
+    """Write the live pages as plain HTML, and all their scripts."""
     sys.path.insert(0, str(LIVE))
     import live_build
 
-    folder = tmp_path_factory.mktemp("live")
     live_build.write_scripts(folder)
     for file in LIVE.glob("*.md"):
         text = file.read_text(encoding="utf-8").replace(GAME, (LIVE / "race.md").read_text("utf-8"))
@@ -274,7 +287,6 @@ def live_pages(tmp_path_factory):
             style = '<link rel="stylesheet" href="live.css"><body>'
             body = "".join(parts)
             (folder / f"{file.stem}.html").write_text(head + style + body, encoding="utf-8")
-    return folder
 
 
 @pytest.fixture

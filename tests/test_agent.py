@@ -5,7 +5,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -173,20 +172,8 @@ def test_the_features_of_a_whole_episode_are_what_c_sees_frame_by_frame(observat
     assert np.array_equal(features[:, 32:], hidden)
 
 
-def test_an_agent_drives_gymnasium_s_own_car_racing(agent):
-    env = gymnasium.make("CarRacing-v3")
-    observation, _ = env.reset(seed=5)
-    agent.reset()
-    for _ in range(10):
-        action = agent.act(observation)
-        assert env.action_space.contains(action)
-        observation, *_ = env.step(action)
-    env.close()
-
-
 def test_a_fresh_script_dreams_by_a_name_and_drives_with_load_agent(quick_run, tmp_path):
     script = f"""
-import gymnasium
 env = gymnasium.make("stad_lab:StadLab/Dream-v0", agent="frame", render_mode="rgb_array")
 env.reset(seed=0)
 env.step(env.action_space.sample())

@@ -19,11 +19,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from docutils.core import publish_doctree
-from docutils.utils import SystemMessage
 from matplotlib.figure import Figure
 from PIL import Image
-from sphinx.ext.napoleon import Config, GoogleDocstring
 
 from stad_course import cli as course
 from stad_lab import cli, command_line
@@ -274,6 +271,10 @@ def documented(module):
 
 @pytest.mark.parametrize("name", blocks.modules())
 def test_every_docstring_of_a_module_is_right_restructuredtext(name):
+    from docutils.core import publish_doctree  # this takes a second
+    from docutils.utils import SystemMessage
+    from sphinx.ext.napoleon import Config, GoogleDocstring
+
     config = Config(napoleon_numpy_docstring=False, napoleon_use_ivar=True)
     strict = {"halt_level": 2, "report_level": 5, "_disable_config": True}
     for where, docstring in documented(importlib.import_module(name)):
@@ -370,7 +371,8 @@ def check_accessible(files, browser):
     """Let axe check the pages at a phone's width, where most blocks scroll."""
     from axe_playwright_python.base import AXE_SCRIPT
 
-    page = browser.new_page(viewport={"width": 360, "height": 700})
+    # A page that moves would draw while axe reads it.
+    page = browser.new_page(viewport={"width": 360, "height": 700}, reduced_motion="reduce")
     page.add_init_script(AXE_SCRIPT)
     assert not (found := [one for file in files for one in all_violations(page, file)]), found
     page.close()

@@ -5,7 +5,6 @@ import secrets
 import sys
 from pathlib import Path
 
-import cma
 import numpy as np
 import pytest
 import torch
@@ -53,6 +52,8 @@ def opened(tabs):
 
 def pycma(start, sigma, normals):
     """pycma's strategy on a stream of standard normal numbers (generations, population, n)."""
+    import cma  # this takes seconds
+
     stream = iter(normals)
 
     def randn(*_):

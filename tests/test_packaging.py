@@ -217,6 +217,7 @@ def test_the_controller_needs_numpy_alone():
     own = {normal(name) for some in (CORE, *EXTRAS.values()) for name in by_name(some)}
     modules = packages_distributions()
     assert {one for one in loaded if {*map(normal, modules.get(one, []))} & own} == {"numpy"}
+    assert not loaded & {"Box2D", "pygame", "cv2"}  # which gymnasium needs
 
 
 @pytest.mark.parametrize(

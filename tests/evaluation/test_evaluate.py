@@ -1,6 +1,7 @@
 """Evaluation: Gymnasium's own tracks, every episode recorded, and no file of a run overwritten."""
 
 import errno
+import functools
 import io
 import os
 import shutil
@@ -14,6 +15,7 @@ from stad_lab import load_agent, make_env
 from stad_lab.agent import PRETRAINED
 from stad_lab.cli import main
 from stad_lab.config import TRACK_RANGES
+from stad_lab.evaluation import evaluate as evaluation
 from stad_lab.evaluation.evaluate import (
     check_output,
     describe,
@@ -298,6 +300,8 @@ def test_without_fast_the_environment_is_gymnasium_s_own(straight_run, monkeypat
         return make_env(True, **options)
 
     monkeypatch.setattr("stad_lab.agent.make_env", noting)
+    briefly = functools.partial(evaluation.drive_group, limits={"max_frames": 20})
+    monkeypatch.setattr(evaluation, "drive_group", briefly)
     with ThreadPoolExecutor(1) as executor:
         for fast in (False, True):
             evaluate(straight_run, 1, 3, fast, executor=executor)

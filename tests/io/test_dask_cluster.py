@@ -20,7 +20,6 @@ from stad_lab.evaluation.evaluate import evaluate
 from stad_lab.io.dask_cluster import check_address, check_versions, cluster, versions
 from stad_lab.io.files import load_json
 from stad_lab.io.workers import TaskError, run_tasks
-from stad_lab.training.dataset import collect
 from stad_lab.training.evolution import LOG, evolve
 from stad_study import cli as study
 from stad_study.study import STUDIES, Study, evaluate_kept, run_study
@@ -94,13 +93,6 @@ def test_what_is_shared_is_sent_once_to_every_worker_and_not_with_each_task(sche
     assert max(arrived for _, arrived in found) == 1
     with Client(scheduler[0], set_as_default=False) as client:
         assert client.amm.running()  # again, as it was before
-
-
-def test_a_collection_on_a_cluster_is_bit_identical(scheduler, quick_run, tmp_path):
-    with cluster(scheduler[0]) as executor:
-        collect(QUICK, tmp_path / "dataset", executor)
-    for path in (quick_run / "dataset").glob("*.*"):
-        assert (tmp_path / "dataset" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_an_evaluation_on_a_cluster_is_bit_identical(scheduler, straight_run):

@@ -58,25 +58,31 @@ def collect_command(folder):
     return ["train", "quick", "--until", "dataset", "--out", str(folder), *changes]
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send to a process")
-@pytest.mark.parametrize("how", ["SIGKILL", "SIGINT"])
-def test_an_interrupted_collection_continues_and_equals_an_uninterrupted_one(
-    how, uninterrupted, tmp_path
-):
-    manifest, arguments = tmp_path / "run" / "dataset" / MANIFEST, collect_command(tmp_path / "run")
+def stop_collecting(arguments, manifest, episodes, how):
+    """Send a signal to a collection that has so many episodes: (the process, its errors)."""
     command = [sys.executable, "-m", "stad_lab", *arguments]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     deadline = time.time() + 120
-    while not manifest.exists() or len(load_json(manifest)["episodes"]) < 3:
+    while not manifest.exists() or len(load_json(manifest)["episodes"]) < episodes:
         assert time.time() < deadline
         time.sleep(0.005)
-    process.send_signal(getattr(signal, how))
-    error = process.communicate(timeout=60)[1]
-    if how == "SIGINT":
-        assert process.returncode == 130, error
-        assert "the same command continues" in error and "Traceback" not in error
-    done = load_json(manifest)["episodes"]
-    assert 3 <= len(done) < MANY["episodes"]  # it was in the middle
+    process.send_signal(how)
+    return process, process.communicate(timeout=60)[1]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send to a process")
+def test_a_collection_interrupted_and_killed_continues_and_equals_an_uninterrupted_one(
+    uninterrupted, tmp_path
+):
+    manifest, arguments = tmp_path / "run" / "dataset" / MANIFEST, collect_command(tmp_path / "run")
+    done = []
+    for how in (signal.SIGINT, signal.SIGKILL):
+        process, error = stop_collecting(arguments, manifest, len(done) + 3, how)
+        if how == signal.SIGINT:
+            assert process.returncode == 130, error
+            assert "the same command continues" in error and "Traceback" not in error
+        earlier, done = done, load_json(manifest)["episodes"]
+        assert len(earlier) + 3 <= len(done) < MANY["episodes"]  # it was in the middle
     before = {path: path.stat().st_mtime_ns for path in manifest.parent.iterdir()}
     assert main(arguments) == 0
     for entry in done:  # not collected again

@@ -12,7 +12,7 @@ from stad_lab import Config
 from stad_lab.training.dataset import Dataset
 from stad_lab.training.vae import train_vae
 
-CONFIG = Config.preset("quick", variant="frame", vae={"steps": 20})
+CONFIG = Config.preset("quick", variant="frame", vae={"steps": 8})
 TRAIN = """
 from pathlib import Path
 from stad_lab import Config
@@ -20,7 +20,7 @@ from stad_lab.training.dataset import Dataset
 from stad_lab.training.vae import train_vae
 from stad_lab.viz.plots import plot_history
 from stad_lab.viz.widgets import watch_training
-config = Config.preset("quick", variant="frame", vae={"steps": 20})
+config = Config.preset("quick", variant="frame", vae={"steps": 8})
 plot = lambda history: plot_history(history, f"step {history[-1]['step']}", "loss")
 folder = Path(FOLDER)
 dataset = lambda: Dataset(folder.parent / "dataset")

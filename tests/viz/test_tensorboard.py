@@ -4,7 +4,6 @@ import shutil
 import sys
 
 import pytest
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from stad_lab.cli import main
 from stad_lab.config import Config
@@ -22,8 +21,16 @@ def told(quick_run, tmp_path_factory):
     run = shutil.copytree(quick_run, tmp_path_factory.mktemp("told") / "run")
     (run / CONTROLLER_FILE).unlink()
     assert main([*TRAIN, str(run)]) == 0
-    events = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0, "images": 0})
-    return run, events.Reload()
+    return run, events_of(run)
+
+
+def events_of(run):
+    """What TensorBoard reads of a run."""
+    # This takes seconds.
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder, all_of_them = str(run / "tensorboard"), {"scalars": 0, "images": 0}
+    return EventAccumulator(folder, size_guidance=all_of_them).Reload()
 
 
 def test_losses_and_returns_are_those_of_the_run(told):
@@ -61,7 +68,7 @@ def test_the_projector_has_a_row_of_z_and_of_motion_for_each_frame(told):
 def test_a_second_call_writes_the_same_curves_once(told):
     run, events = told
     assert main([*TRAIN, str(run)]) == 0
-    again = EventAccumulator(str(run / "tensorboard")).Reload()
+    again = events_of(run)
     steps = [[one.step for one in each.Scalars("mdn_rnn/train/total")] for each in (events, again)]
     assert steps[0] == steps[1]
 
