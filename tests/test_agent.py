@@ -174,6 +174,7 @@ def test_the_features_of_a_whole_episode_are_what_c_sees_frame_by_frame(observat
 
 def test_a_fresh_script_dreams_by_a_name_and_drives_with_load_agent(quick_run, tmp_path):
     script = f"""
+import gymnasium
 env = gymnasium.make("stad_lab:StadLab/Dream-v0", agent="frame", render_mode="rgb_array")
 env.reset(seed=0)
 env.step(env.action_space.sample())

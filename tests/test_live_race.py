@@ -48,6 +48,7 @@ def test_a_gamepad_begins_a_race_but_holding_it_does_not_end_a_pause(opened):
     phase(page, "race")
     page.wait_for_function("stad.page.state.action[1] === 0")
     page.click("#auto")
+    page.wait_for_selector("#auto[aria-pressed=true]")
     page.evaluate("trigger.value = 0.5")
     page.wait_for_selector("#auto[aria-pressed=false]")
 

@@ -61,7 +61,9 @@ def test_a_script_with_gymnasium_alone_finds_the_same_return(whole, straight_run
     agent.reset()
     total, frames, ended = 0.0, 0, False
     while not ended:
-        observation, reward, terminated, truncated, _ = env.step(agent.act(observation))
+        action = agent.act(observation)
+        assert env.action_space.contains(action)
+        observation, reward, terminated, truncated, _ = env.step(action)
         total, frames, ended = total + reward, frames + 1, terminated or truncated
     env.close()
     assert whole["renderer"] == "gymnasium"

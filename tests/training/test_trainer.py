@@ -153,6 +153,9 @@ def test_a_half_trained_v_continues_with_another_sigma_and_with_no_other_setting
     assert [file.name for file in tmp_path.glob("[!.]*")] == ["vae.safetensors"]
     found, expected = (load_file(one / "vae.safetensors") for one in (tmp_path, quick_run))
     assert all(found[name].equal(expected[name]) for name in expected)
+    files = (one / "vae.safetensors" for one in (tmp_path, quick_run))
+    resumed, straight = (load_tensors(file)[1]["history"] for file in files)
+    assert resumed == straight
 
 
 def test_a_checkpoint_made_before_a_setting_existed_continues(dataset, tmp_path, interrupt_after):

@@ -62,7 +62,8 @@ stad.Chart = class {
     }
     for (const { points, color, dash = [] } of this.content.lines) {
       context.setLineDash(dash);
-      stad.strokeLine(context, points.map(([x, y]) => [this.x(x), this.y(y)]), color, 2); // prettier-ignore
+      const places = points.map(([x, y]) => [this.x(x), this.y(y)]);
+      stad.strokeLine(context, places, color, 2);
     }
     context.setLineDash([]);
     for (const { x, text: words } of this.content.marks) {

@@ -315,6 +315,7 @@ stad.start(async () => {
     untouched = false; // without networks the eyes stay open
     cancelWish();
     setPlaying(false);
+    draw();
     throw error;
   });
   encoded = new stad.EncodedEpisode(vae, mdnRnn, drive);

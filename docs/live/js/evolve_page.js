@@ -15,7 +15,9 @@ stad.start(async () => {
   let [settings, log, states, bet] = [null, [], [], null];
   let upcoming = null; // what CMA-ES has asked for, and nobody has driven yet
   let finished = null; // the candidates that have driven last, and where they came from
-  let [wanted, run] = [0, 0]; // generations to drive; a number for each fresh start
+  let wanted = 0; // generations to drive
+  let [starts, run] = [0, 0]; // how many fresh starts were wished for, and how many have begun
+  let wished = null; // settings of the newest of them
   let [paused, idle] = [null, 0]; // since when, and for how long in this generation; milliseconds
   let [driving, beginning] = [null, null]; // promises, while this goes on
   let identity = null; // of V and M, for the file
@@ -23,8 +25,8 @@ stad.start(async () => {
   // --- One generation -----------------------------------------------------------------------------
 
   async function drive() {
-    const own = run;
     await beginning.catch(() => {}); // after one that failed the earlier evolution goes on
+    const own = run;
     while (wanted > 0 && own === run) {
       wanted -= 1;
       await generation(own);
@@ -66,31 +68,38 @@ stad.start(async () => {
   }
 
   /** Begin an evolution afresh, or go on with a kept log. */
-  async function begin(chosen, kept = []) {
-    const [own, before, earlier] = [++run, driving, settings];
-    [settings, wanted, paused] = [chosen, 0, null];
-    await crew.stop();
-    await before;
+  async function begin(chosen, kept) {
+    const [mine, before] = [++starts, driving];
+    [wished, wanted] = [chosen, 0];
     let loaded;
     try {
       loaded = await loadNetworks(chosen);
     } catch (error) {
-      if (own !== run) return; // another start has overtaken this one
-      settings = earlier;
+      if (mine !== starts) return; // another start has overtaken this one
+      wished = settings;
       throw Object.assign(error, { loading: true });
     }
+    if (mine !== starts) return;
+    const own = ++run;
+    [settings, paused] = [chosen, null];
+    await crew.stop();
+    await before;
     if (own !== run) return;
     identity = loaded.identity;
     await crew.callAll("choose", loaded.networks);
+    if (own !== run) return;
     const inputs = INPUTS[settings.sees];
-    const found = await crew.lead("evolve", { settings, inputs, log: kept });
+    const found = await crew.lead("evolve", { settings, inputs, log: kept?.log ?? [] });
     const next = await crew.lead("ask");
     const track = await crew.lead("track", { seed: next.tracks[0] });
     if (own !== run) return;
-    [log, states, upcoming, finished, saved] = [kept, found, next, null, 0];
+    if (kept) bet = kept.bet ?? null;
+    else if (log.length) bet = null; // it was on that evolution
+    [log, states, upcoming, finished, saved] = [kept?.log ?? [], found, next, null, 0];
     view.begin(track, settings.population + 1, "");
     stad.evolveSettings.show(settings);
     show();
+    if (wanted > 0) go(wanted); // an impatient reader has pressed Start meanwhile
   }
 
   function restart(chosen, kept) {
@@ -103,9 +112,8 @@ stad.start(async () => {
     const address = location.hash;
     const kept = stad.evolveSettings.kept();
     const first = kept?.settings ?? stad.evolveSettings.fromAddress();
-    bet = kept?.bet ?? null;
     try {
-      await restart(first, kept?.log);
+      await restart(first, kept);
       get("answer").textContent ||= stad.evolveSettings.ignored(address);
     } catch (error) {
       if (error.loading) throw error; // what was kept is as good as before
@@ -207,7 +215,6 @@ stad.start(async () => {
     ask(!wrong && !sure);
     get("restart").focus(); // Safari does not, and then no blur would take the question back
     if (wrong || !sure) return;
-    if (log.length) bet = null; // it was on that evolution
     restart(stad.evolveSettings.fromControls()).catch(stad.fail);
   });
   for (const name of stad.evolveSettings.NAMES)
@@ -230,8 +237,9 @@ stad.start(async () => {
     download().catch((error) => (get("answer").textContent = error.message)),
   );
   addEventListener("hashchange", () => {
+    if (!stad.page) return location.reload(); // it has not started
     const asked = stad.evolveSettings.fromAddress();
-    if (stad.evolveSettings.asked && !stad.evolveSettings.equal(asked, settings))
+    if (stad.evolveSettings.asked && !stad.evolveSettings.equal(asked, wished))
       open().catch(stad.fail);
   });
 

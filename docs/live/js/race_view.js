@@ -9,7 +9,7 @@ globalThis.stad ??= {};
   const PIECE = 20; // tiles
   const LARGE = "600 17px system-ui, sans-serif";
 
-  /** The track with its road in pieces, each as one path for each shade, and as a line for the map. */
+  /** The track with its road in pieces, a path for each shade, and as a line for the map. */
   stad.prepareRoad = (track) => {
     const polygon = (path, corners, i) => {
       path.moveTo(corners[8 * i], corners[8 * i + 1]);
@@ -227,10 +227,10 @@ globalThis.stad ??= {};
     context.textAlign = "center";
     context.fillStyle = "#000b";
     context.beginPath();
-    context.roundRect(width / 2 - 130, 0.28 * height - 25, 260, 62, 10);
+    context.roundRect(width / 2 - 130, 0.4 * height - 25, 260, 62, 10);
     context.fill();
     context.fillStyle = "#fff";
-    context.fillText("Hold a side to steer.", width / 2, 0.28 * height);
-    context.fillText("Gas comes by itself.", width / 2, 0.28 * height + 24);
+    context.fillText("Hold a side to steer.", width / 2, 0.4 * height);
+    context.fillText("Gas comes by itself.", width / 2, 0.4 * height + 24);
   }
 }
