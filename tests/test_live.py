@@ -268,6 +268,34 @@ def test_sliders_the_map_and_another_v_change_the_picture_and_reset_brings_it_ba
     page.wait_for_function("document.querySelector('#frame').ariaLabel === 'recorded frame 121'")
 
 
+# The next file of weights does not arrive.
+LOSE = """() => {
+    const load = stad.loadTensors
+    stad.loadTensors = (name) => {
+        stad.loadTensors = load
+        throw new Error(`${name} did not arrive`)
+    }
+}"""
+CHOOSE = {
+    "race": """(name) => {
+        document.querySelector("#agent").value = name
+        document.querySelector("#agent").dispatchEvent(new Event("change"))
+    }""",
+    "latent": "(name) => document.querySelector(`input[value=${name}]`).click()",
+}
+
+
+@pytest.mark.parametrize("name", CHOOSE)
+def test_after_a_network_that_does_not_arrive_another_one_can_be_chosen(name, opened):
+    page = opened(name, reduced_motion="reduce")
+    page.evaluate(LOSE)
+    page.evaluate(CHOOSE[name], "output")
+    page.wait_for_selector("#live[data-state=failed]")
+    page.evaluate(CHOOSE[name], "input")
+    page.wait_for_selector("#live[data-state=ready]")
+    assert page.is_hidden("#message")
+
+
 READY = """async () => {
     const errors = []
     addEventListener("error", (event) => errors.push(event.message))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from test_live import LOSE
 
 from stad_lab.agent import drive, load_agent
 from stad_lab.io.weights import load_controller
@@ -19,13 +20,6 @@ FAIL_ONCE = """() => {
     stad.controllerFile = async () => {
         stad.controllerFile = make
         throw new Error("no download")
-    }
-}"""
-LOSE = """() => {
-    const load = stad.loadTensors
-    stad.loadTensors = (name) => {
-        stad.loadTensors = load
-        throw new Error(`${name} did not arrive`)
     }
 }"""
 TILE = 1000 / 200  # points; a track has more tiles
