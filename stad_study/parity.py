@@ -5,8 +5,8 @@ import numpy as np
 from stad_lab.config import track_seeds
 from stad_lab.envs.car_racing import MAX_FRAMES, CarRacing, make_env, place_car
 from stad_lab.envs.cars import Cars
-from stad_lab.envs.frames import to_frame
-from stad_lab.envs.picture import BAR_TOP, HULL_COLUMN, HULL_ROW
+from stad_lab.envs.frames import BAR_TOP, to_frame
+from stad_lab.envs.picture import HULL_COLUMN, HULL_ROW
 from stad_lab.training.dataset import RandomDriver
 
 CAR_WINDOW = (slice(HULL_ROW - 12, HULL_ROW + 12), slice(HULL_COLUMN - 12, HULL_COLUMN + 12))

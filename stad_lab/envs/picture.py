@@ -42,15 +42,13 @@ from gymnasium.envs.box2d import car_dynamics
 from gymnasium.envs.box2d import car_racing as reference
 
 from stad_lab.envs.compiling import compiled
+from stad_lab.envs.frames import BAR_TOP, OBSERVATION_SIZE
 
 fast = compiled(error_model="numpy")
 merged = compiled(error_model="numpy", inline="always")  # into its one caller
 
 # The pictures, and Gymnasium's window, whose coordinates we share.
-OBSERVATION_SIZE = 96  # pixels, width and height of the observation
-BAR_TOP = 84  # the first row of the observation that belongs to the indicator bar
-BAR_ROWS = OBSERVATION_SIZE - BAR_TOP
-FRAME_SIZE = 64  # pixels, width and height of the agent's frame
+BAR_ROWS = OBSERVATION_SIZE - BAR_TOP  # of the observation
 WINDOW_W, WINDOW_H = float(reference.WINDOW_W), float(reference.WINDOW_H)  # window pixels
 PIXEL_W, PIXEL_H = WINDOW_W / OBSERVATION_SIZE, WINDOW_H / OBSERVATION_SIZE  # of the observation
 ZOOM = reference.ZOOM * reference.SCALE  # window pixels per world unit, after the first second

@@ -13,7 +13,7 @@ from gymnasium.wrappers import FrameStackObservation, RecordVideo
 
 from stad_lab import make_env
 from stad_lab.envs.car_racing import MAX_FRAMES, place_car
-from stad_lab.envs.picture import BAR_TOP
+from stad_lab.envs.frames import BAR_TOP
 from stad_lab.training.dataset import RandomDriver
 from stad_study.parity import AREAS, compare_pictures
 

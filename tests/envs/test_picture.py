@@ -7,12 +7,10 @@ import pytest
 
 from stad_lab.envs import physics, picture
 from stad_lab.envs.car_racing import make_env, place_car
-from stad_lab.envs.frames import to_frame
+from stad_lab.envs.frames import BAR_TOP, to_frame
 from stad_lab.envs.track import MAX_TILES
 from stad_lab.training.dataset import RandomDriver
 from stad_study.parity import CAR_WINDOW
-
-BAR_TOP = picture.BAR_TOP
 
 
 class Painter:

@@ -8,7 +8,7 @@ from gymnasium.error import ClosedEnvironmentError, ResetNeeded
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from stad_lab.envs.car_racing import make_env
-from stad_lab.envs.picture import BAR_TOP
+from stad_lab.envs.frames import BAR_TOP
 from stad_lab.envs.vector import CarRacingVector
 
 CARS, LIMIT = 3, 20  # frames of an episode
