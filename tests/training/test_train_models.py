@@ -87,6 +87,24 @@ def test_v_does_not_learn_from_held_out_episodes(data, quick_run, tmp_path):
     assert second > 2 * first
 
 
+def test_a_training_interrupted_twice_equals_an_uninterrupted_one_bit_for_bit(
+    data, tmp_path, interrupt_after
+):
+    config = QUICK.replace(variant="output", vae={"width": 4})
+    one_go, interrupted = (tmp_path / name / "vae.safetensors" for name in ("one_go", "stopped"))
+    for updates in (1, 17):  # before the first checkpoint, and between two of them
+        hook = interrupt_after(updates)
+        with pytest.raises(KeyboardInterrupt):
+            train_vae(config, data, interrupted.parent)
+        hook.remove()
+        assert not interrupted.exists()
+    for file in (one_go, interrupted):
+        assert train_vae(config, data, file.parent)
+    assert one_go.read_bytes() == interrupted.read_bytes()
+    left = [file.name for file in interrupted.parent.glob("[!.]*")]
+    assert left == ["vae.safetensors"]  # no checkpoint
+
+
 def test_an_interrupted_training_of_m_equals_an_uninterrupted_one_bit_for_bit(
     data, run_with_v, interrupt_after
 ):
