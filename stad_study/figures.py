@@ -6,7 +6,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from stad_lab.viz.plots import (
-    DASHES,
     VARIANT_STYLES,
     caption,
     describe,
@@ -168,17 +167,17 @@ def plot_learning_curves(curves: dict[str, dict]) -> Figure:
     Args:
         curves: "FEATURES: VARIANT" -> "episodes", "mean", "low" and "high" of the difference.
     """
-    figure, axes = new_figure(8.6, 4.0, 1, 2, sharex=True, sharey=True)
     variants = list(COLOURS)[1:]
-    for axis, (features, title) in zip(axes[0], SEEN.items(), strict=True):
-        axis.axhline(0, color="black", linewidth=0.8)
-        for variant, dash in zip(variants, DASHES, strict=False):
+    figure, axes = new_figure(8.6, 4.8, 2, len(variants), sharex=True, sharey=True)
+    for row, (features, title) in zip(axes, SEEN.items(), strict=True):
+        for axis, variant in zip(row, variants, strict=True):
             one, colour = curves[f"{features}: {variant}"], COLOURS[variant]
-            axis.fill_between(one["episodes"], one["low"], one["high"], color=colour, alpha=0.15)
-            axis.plot(one["episodes"], one["mean"], dash, color=colour, label=variant)
-        caption(axis, title, "episodes, those of the dataset included")
-    axes[0, 0].set_ylabel("validation mean minus that of frame")
-    legend_below(figure, axes[0, 0])
+            axis.axhline(0, color="black", linewidth=0.8)
+            axis.fill_between(one["episodes"], one["low"], one["high"], color=colour, alpha=0.2)
+            axis.plot(one["episodes"], one["mean"], color=colour)
+            caption(axis, f"{variant}, {title}")
+    figure.supylabel("validation mean minus that of frame", fontsize=9)
+    figure.supxlabel("episodes, those of the dataset included", fontsize=9)
     ends = [f"{seen}: " + ", ".join(f"{one} {curves[f'{features}: {one}']['mean'][-1]:+.0f}"
             for one in variants) for features, seen in SEEN.items()]  # fmt: skip
     title = "Study 1: learning curves minus that of frame, with 95% intervals of the mean"
