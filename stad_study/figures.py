@@ -107,10 +107,10 @@ def plot_cause(comparisons: dict[str, dict], margin: float) -> Figure:
     for height, (title, one) in enumerate(rows.items()):
         plot_comparison(axis, height, one, COLOURS[title.split()[0].rstrip(":")])
     name_rows(axis, [title.replace(": ", ":\n") for title in rows])
-    axis.set_xlabel("difference, points")
+    axis.set_xlabel("difference, points (a score is the mean of three C)")
     legend_below(figure, axis)
     told = [f"{title} {difference_of(one)}" for title, one in rows.items()]
-    return describe(figure, "Study 5: a score is the mean of three C", "Means: ", ["; ".join(told)])
+    return describe(figure, "Study 5: the differences", "Means: ", ["; ".join(told)])
 
 
 def plot_cause_curves(arms: dict[str, dict], every: int) -> Figure:
