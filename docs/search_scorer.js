@@ -1,4 +1,4 @@
-// How Sphinx ranks what a search finds: its own numbers, but pages to read come before the reference.
+// How Sphinx ranks what a search finds: its own numbers, but pages come before the reference.
 var Scorer = {
   score: ([docname, , , , score]) => (docname.startsWith("docs/modules/") ? score - 20 : score),
   objNameMatch: 11,

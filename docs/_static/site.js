@@ -1,4 +1,4 @@
-// Two helps that every page needs: keys scroll whatever is wider than the page, and films can pause.
+// What every page needs: keys scroll whatever is wider than the page, and films can pause.
 
 const SCROLLING = "article pre, article .table-wrapper, article .cell_output table, article .math";
 const FILMS = 'article img[src$=".gif"], article img[src^="data:image/gif"]';
@@ -13,7 +13,8 @@ function letKeysScroll() {
 
 /** Add a button that stops a film at its first picture; it begins stopped if `paused`. */
 function addPause(film, paused) {
-  const [box, still, button] = ["span", "canvas", "button"].map((tag) => document.createElement(tag));
+  const tags = ["span", "canvas", "button"];
+  const [box, still, button] = tags.map((tag) => document.createElement(tag));
   still.width = film.naturalWidth;
   still.height = film.naturalHeight;
   still.getContext("2d").drawImage(film, 0, 0); // of a film this draws the first picture

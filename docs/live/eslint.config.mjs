@@ -12,5 +12,6 @@ export default [
         ...globals.worker,
       },
     },
+    rules: { "max-len": ["error", 100] },
   },
 ];

@@ -17,9 +17,11 @@
   const held = new Map(); // key or button that is down -> its pedal
   let escaped = false, sent = "";
 
-  const typing = () => document.activeElement?.matches("input, textarea, select, [contenteditable=true]");
+  const fields = "input, textarea, select, [contenteditable=true]";
+  const typing = () => document.activeElement?.matches(fields);
   const running = () => go.classList.contains("mod-active");
-  const listens = () => // after an episode, too: a key that is still held is no command of JupyterLab
+  // After an episode, too: a key that is still held is no command of JupyterLab.
+  const listens = () =>
     seat.isConnected && seat.classList.contains("stad-lab-driving") && !escaped && !typing();
 
   function send() { // the kernel gets the state, not the events: it may skip some, but ends right

@@ -104,7 +104,7 @@ globalThis.stad ??= {};
     const c1 = (Math.min(1, population / 6) * 2) / ((n + 1.3) ** 2 + mueff);
     const cmu = Math.min(1 - c1, (2 * (0.25 + mueff - 2 + 1 / mueff)) / ((n + 2) ** 2 + mueff));
     const cs = Math.min(0.5, (mueff + 2) / (n + mueff + 3));
-    // Bounds on the negative weights: no decay in sum, trust as far as mueff goes, C stays positive.
+    // Bounds on the negative weights: no decay in sum, trust as far as mueff goes, C positive.
     const least = Math.min(
       1 + c1 / cmu,
       (1 - c1 - cmu) / cmu / n,
@@ -136,7 +136,7 @@ globalThis.stad ??= {};
       this.covariance = new Float64Array(n * n);
       for (let i = 0; i < n; i++) this.covariance[i * n + i] = 1;
       this.axes = { values: Array(n).fill(1), vectors: null }; // C is round: no vectors needed
-      this.pathSigma = new Float64Array(n); // of the mean, in units in which the distribution is round
+      this.pathSigma = new Float64Array(n); // of the mean, where the distribution is round
       this.pathC = new Float64Array(n); // of the mean, in units of sigma
       this.generation = this.decomposed = 0;
       this.constants = parameters(population, n);
@@ -225,7 +225,7 @@ globalThis.stad ??= {};
       }
     }
 
-    /** The ellipse of one standard deviation along two coordinates: half axes, longer one's angle. */
+    /** The ellipse of one standard deviation in two coordinates: half axes, longer one's angle. */
     ellipse(i = 0, j = 1) {
       const at = (row, column) => this.covariance[row * this.n + column];
       const { large, small, angle } = ellipseOf([at(i, i), at(i, j), at(j, j)]);
@@ -233,7 +233,7 @@ globalThis.stad ??= {};
     }
   };
 
-  /** Functions of (x, y) to minimise, each with its best points and the part of the plane to show. */
+  /** Functions of (x, y) to minimise, each with its best points and the part to show. */
   stad.landscapes = {
     sphere: { name: "Sphere", f: (x, y) => x * x + y * y, minima: [[0, 0]], reach: 4 },
     ellipse: {

@@ -102,7 +102,7 @@ stad.start(async () => {
     const [steering, gas, brake] = dream ? hand.action : drive.action(t);
     const over = dream && from + dream.frames >= drive.length;
     const names = { agent: "C drives", hand: "you drive", recorded: "recorded actions" };
-    const wheel = names[over && driver === "recorded" ? "agent" : driver]; // nothing else is recorded
+    const wheel = names[over && driver === "recorded" ? "agent" : driver]; // no more is recorded
     set("t", `${t}${over ? ", the recording has ended" : ""}`);
     set("dream-name", dream ? "The dream" : encoded?.latents[t] ? "Reconstruction" : "Seen");
     const open = waiting ? "M is processing the episode up to this frame." : "The eyes are open.";
@@ -125,7 +125,8 @@ stad.start(async () => {
     get("bar-steering").style.transform = `scaleX(${steering})`;
     get("bar-gas").style.transform = `scaleX(${gas})`;
     get("bar-brake").style.transform = `scaleX(${brake})`;
-    const pedals = `steering ${steering.toFixed(1)}, gas ${gas.toFixed(1)}, brake ${brake.toFixed(1)}`;
+    const [turn, press, stop] = [steering, gas, brake].map((pedal) => pedal.toFixed(1));
+    const pedals = `steering ${turn}, gas ${press}, brake ${stop}`;
     stad.describe(get("real"), `recorded episode, frame ${t} of ${drive.length}`);
     const distance = distances.at(-1)?.[1].toFixed(2);
     stad.describe(

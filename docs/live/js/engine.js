@@ -10,7 +10,7 @@ stad.seconds = (frames, digits = 1) => (frames / stad.FRAMES_A_SECOND).toFixed(d
 stad.LONGEST = 1000; // frames of an episode
 
 {
-  // --- Random numbers: NumPy's SeedSequence and PCG64 ---------------------------------------------
+  // --- Random numbers: NumPy's SeedSequence and PCG64 --------------------------------------------
 
   const MASK32 = 0xffffffffn;
   const MASK128 = (1n << 128n) - 1n;
@@ -72,12 +72,14 @@ stad.LONGEST = 1000; // frames of an episode
     }
   };
 
-  // --- The C library ------------------------------------------------------------------------------
+  // --- The C library ----------------------------------------------------------------------------
 
   // sin and cos of float32 as glibc rounds them; those of JavaScript differ in the last bit now and
   // then. Polynomials in double precision after a reduction to a quarter turn.
   // prettier-ignore
-  const COSINE = [1, -0.49999999725108224, 0.041666623324344516, -0.001388676379437604, 2.4390450703564542e-05];
+  const COSINE = [
+    1, -0.49999999725108224, 0.041666623324344516, -0.001388676379437604, 2.4390450703564542e-5,
+  ];
   const NEGATIVE = COSINE.map((value) => -value);
   const SINE = [-0.16666654943701084, 0.008332178146138854, -0.00019517298981385725];
   const [PER_TURN, QUARTER] = [10680707.430881744, Math.PI / 2];
@@ -147,7 +149,7 @@ stad.LONGEST = 1000; // frames of an episode
     };
   }
 
-  // --- The engine ---------------------------------------------------------------------------------
+  // --- The engine -------------------------------------------------------------------------------
 
   const SIZES = { observation: 96, frame: 64 };
   const [ROAD, WHITE, RED, GRASS, OUTSIDE] = [8, 12, 16, 4, 20]; // kinds of ground, as picture.py
@@ -285,7 +287,7 @@ stad.LONGEST = 1000; // frames of an episode
     }
   };
 
-  // --- One car ------------------------------------------------------------------------------------
+  // --- One car ----------------------------------------------------------------------------------
 
   stad.Car = class {
     constructor(engine) {

@@ -65,7 +65,7 @@ globalThis.stad ??= {};
       });
     }
 
-    /** The distribution: mean, sigma, and the ellipse in the plane of the two numbers moved most. */
+    /** The distribution: mean, sigma, and the ellipse of the two numbers moved most. */
     state() {
       const { mean, sigma } = this.strategy;
       const moved = mean.map((value, i) => Math.abs(value - this.first[i]));

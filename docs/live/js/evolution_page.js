@@ -94,10 +94,11 @@ stad.start(async () => {
   function drawDream() {
     stad.paintFrame(stad.get("dream"), vae.decode(dream.z).frame);
     const seconds = stad.seconds(dream.frames);
-    stad.get("dream-text").textContent = `generation ${generations[chosen]}, ${seconds} s`;
+    const generation = `generation ${generations[chosen]}`;
+    stad.get("dream-text").textContent = `${generation}, ${seconds} s`;
     stad.describe(
       stad.get("dream"),
-      `M's dream, driven by the mean driver of generation ${generations[chosen]}, after ${seconds} seconds.`,
+      `M's dream, driven by the mean driver of ${generation}, after ${seconds} seconds.`,
     );
   }
 
@@ -153,9 +154,10 @@ stad.start(async () => {
       marks: [{ x: generation, text: `generation ${generation}` }],
     });
     const shown = generation ? run.mean[generation - 1] : null;
+    const [first, last] = [run.mean[0], run.mean.at(-1)].map((points) => points.toFixed(0));
     stad.describe(
       stad.get("learning"),
-      `Return over ${count} generations. The average candidate's rises from ${run.mean[0].toFixed(0)} to ${run.mean.at(-1).toFixed(0)}.` +
+      `Return over ${count} generations. The average candidate's rises from ${first} to ${last}.` +
         (shown === null ? "" : ` In generation ${generation}: ${shown.toFixed(0)}.`),
     );
     drawTrack();

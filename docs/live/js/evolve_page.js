@@ -1,5 +1,5 @@
 "use strict";
-// The page "Evolve a driver": asks CMA-ES for a generation, lets the workers drive it, and shows it.
+// The page "Evolve a driver": asks CMA-ES for a generation, has the workers drive it, shows it.
 
 stad.start(async () => {
   const get = stad.get;
@@ -22,7 +22,7 @@ stad.start(async () => {
   let [driving, beginning] = [null, null]; // promises, while this goes on
   let identity = null; // of V and M, for the file
 
-  // --- One generation -----------------------------------------------------------------------------
+  // --- One generation ---------------------------------------------------------------------------
 
   async function drive() {
     await beginning.catch(() => {}); // after one that failed the earlier evolution goes on
@@ -134,7 +134,7 @@ stad.start(async () => {
     return { networks, identity: { variant, vae: v, mdn_rnn: m } };
   }
 
-  // --- Pictures, words and buttons ----------------------------------------------------------------
+  // --- Pictures, words and buttons --------------------------------------------------------------
 
   function show() {
     const inputs = INPUTS[settings.sees];
@@ -164,7 +164,7 @@ stad.start(async () => {
     view.map.draw();
   }
 
-  // --- Controls -----------------------------------------------------------------------------------
+  // --- Controls ---------------------------------------------------------------------------------
 
   /** Drive so many more generations. */
   function go(count) {

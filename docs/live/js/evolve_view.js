@@ -1,5 +1,5 @@
 "use strict";
-// What the page "Evolve a driver" shows after a generation: curves, the plane of two weights, words.
+// What the page "Evolve a driver" shows after a generation: curves, a plane of two weights, words.
 globalThis.stad ??= {};
 
 {
@@ -130,8 +130,9 @@ globalThis.stad ??= {};
       const time = (count) => `${total("seconds", count).toFixed(0)} seconds`;
       const driven = `${total("frames").toLocaleString("en")} frames in ${time()}.`;
       get("driven").textContent = number ? driven : "";
+      const said = bet ? `You said ${bet}: the` : "The";
       get("answer").textContent = lap
-        ? `${bet ? `You said ${bet}: the` : "The"} first complete lap came in generation ${lap}, after ${time(lap)}.`
+        ? `${said} first complete lap came in generation ${lap}, after ${time(lap)}.`
         : "";
       stad.describe(get("map"), `A track from above, with all candidates. ${text}`);
       stad.describe(get("learning"), `Points of ${number} generations. ${text}`);

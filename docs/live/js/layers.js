@@ -1,7 +1,7 @@
 "use strict";
 // The layers of V and M. All but the decoder's convolutions run in the compiled engine, as
-// `run_layer` of stad_lab/inference.py. Pictures are flat, rows x columns x channels: the numbers of
-// one pixel lie side by side. This script also runs in a worker, so it touches no document.
+// `run_layer` of stad_lab/inference.py. Pictures are flat, rows x columns x channels: the numbers
+// of one pixel lie side by side. This script also runs in a worker, so it touches no document.
 globalThis.stad ??= {};
 
 {
@@ -44,7 +44,7 @@ globalThis.stad ??= {};
 
   /**
    * A convolution of stride 2 without padding and a ReLU, as torch.nn.Conv2d.
-   * @param {{shape: number[], data: Float32Array}} weight of shape (outputs, inputs, kernel, kernel)
+   * @param {{shape: number[], data: Float32Array}} weight (outputs, inputs, kernel, kernel)
    * @param {{data: Float32Array}} bias
    * @param {number} size width and height of its input, in pixels
    * @param {number} channels of its input: those beyond `inputs` are filled up

@@ -1,7 +1,7 @@
 "use strict";
 // M, the MDN-RNN: an LSTM that predicts the next z as a mixture of Gaussians.
-// The same as stad_lab/models/mdn_rnn.py, with its weights, for one car and one step. Its layers run
-// in the compiled engine. This script also runs in a worker, so it touches no document.
+// The same as stad_lab/models/mdn_rnn.py, with its weights, for one car and one step. Its layers
+// run in the compiled engine. This script also runs in a worker, so it touches no document.
 globalThis.stad ??= {};
 
 stad.Mixture = class {

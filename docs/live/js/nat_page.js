@@ -106,22 +106,25 @@ stad.start(async () => {
       }),
     );
     const active = one.kl_of_latents.filter((value) => value > ACTIVE).length;
-    const bits = (one.kl / Math.LN2).toFixed(1);
+    const latents = one.kl_of_latents.length;
+    const [nats, bits] = [one.kl.toFixed(1), (one.kl / Math.LN2).toFixed(1)];
+    const error = distortion(one).toFixed(0);
     const text =
-      `KL of z: ${one.kl.toFixed(1)} nats (${bits} bits) for a frame, ` +
-      `${active} of ${one.kl_of_latents.length} latents active. Squared error: ${distortion(one).toFixed(0)}.`;
+      `KL of z: ${nats} nats (${bits} bits) for a frame, ` +
+      `${active} of ${latents} latents active. Squared error: ${error}.`;
     stad.get("summary").textContent = text;
     stad.announce(`KL weight ${one.kl_weight}: ${text}`);
     curve.show({ lines: [{ points, color: stad.COLORS.blue }] });
     stad.describe(
       stad.get("curve"),
-      `Rate against distortion. At KL weight ${one.kl_weight}: ${one.kl.toFixed(1)} nats and error ${distortion(one).toFixed(0)}. ` +
+      `Rate against distortion. At KL weight ${one.kl_weight}: ${nats} nats and error ${error}. ` +
         "The error falls steeply up to some 10 nats, and not beyond 50.",
     );
     const [first] = sorted(one);
     stad.describe(
       stad.get("bars"),
-      `KL of each latent: ${active} are active, ${one.kl_of_latents.length - active} have collapsed. The largest has ${first.toFixed(1)} nats.`,
+      `KL of each latent: ${active} are active, ${latents - active} have collapsed. ` +
+        `The largest has ${first.toFixed(1)} nats.`,
     );
     drawBars();
   }

@@ -20,7 +20,7 @@ stad.start(async () => {
   if (evolved) get("agent").append(new Option("evolved driver", "evolved"));
   get("agent").value = evolved ? "evolved" : agent;
 
-  // --- The worker ---------------------------------------------------------------------------------
+  // --- The worker -------------------------------------------------------------------------------
 
   async function startWorker() {
     const { workers, engine } = await stad.startWorkers("race", 1);
@@ -73,7 +73,7 @@ stad.start(async () => {
     tell();
   }
 
-  // --- Drawing ------------------------------------------------------------------------------------
+  // --- Drawing ----------------------------------------------------------------------------------
 
   function draw() {
     requestAnimationFrame(draw);
@@ -103,7 +103,7 @@ stad.start(async () => {
     stad.drawBars(get("bars"), z, 3, () => stad.COLORS[asleep ? "purple" : "blue"]);
   }
 
-  // --- Words --------------------------------------------------------------------------------------
+  // --- Words ------------------------------------------------------------------------------------
 
   const set = (id, text) => stad.setText(get(id), text);
 
@@ -116,9 +116,10 @@ stad.start(async () => {
     set("time", `${stad.seconds(time)} s`);
     const driven = Math.round(100 * you.tiles);
     const name = driver ? "evolved driver" : `agent ${agent}`;
+    const where = `on track ${seed}`;
     const text = {
-      attract: `The ${name} drives on track ${seed}. Touch the picture or press the up arrow to race it.`,
-      race: `You race on track ${seed}: ${driven}% of the lap, ${mine} points.`,
+      attract: `The ${name} drives ${where}. To race it, touch the picture or press the up arrow.`,
+      race: `You race ${where}: ${driven}% of the lap, ${mine} points.`,
       paused: `Paused at ${driven}% of the lap.`,
       over: `The race is over: you ${mine}, the agent ${rival.score.toFixed(0)} points.`,
     }[phase];
@@ -214,7 +215,7 @@ stad.start(async () => {
     }
   }
 
-  // --- Address, eyes and controls -----------------------------------------------------------------
+  // --- Address, eyes and controls ---------------------------------------------------------------
 
   function readAddress() {
     const asked = new URLSearchParams(location.hash.slice(1));
@@ -312,10 +313,11 @@ stad.start(async () => {
     released = false;
     if (state?.phase === "attract") begin();
     else if (state?.phase === "paused") setPaused(false);
-    else if (state?.phase === "over" && performance.now() - endedAt > 1500) begin(); // not by chance
+    // A key that was still held when the race ended begins no other.
+    else if (state?.phase === "over" && performance.now() - endedAt > 1500) begin();
   }
 
-  let [touching, touched, endedAt] = [false, false, 0]; // a finger drives; has steered; when it ended
+  let [touching, touched, endedAt] = [false, false, 0]; // a finger drives, has steered; its end
   const KEYS = { ...stad.PEDAL_KEYS, Space: "brake" };
   const TAKES_KEYS = "select, textarea, input:not([type=checkbox])";
 
@@ -493,6 +495,14 @@ stad.start(async () => {
   await new Promise((done) => {
     const timer = setInterval(() => state && track && (clearInterval(timer), done()), 10);
   });
-  stad.page = { worker, get state() { return state; }, get track() { return track; } }; // prettier-ignore
+  stad.page = {
+    worker,
+    get state() {
+      return state;
+    },
+    get track() {
+      return track;
+    },
+  };
   requestAnimationFrame(draw);
 });

@@ -58,7 +58,7 @@ stad.Race = class {
     this.engine = await stad.Engine.make(code, facts, tables);
   }
 
-  /** The tensors of an agent's networks: it drives the ghost, and its V and M are also the reader's. */
+  /** The tensors of an agent's networks: it drives the ghost; V and M are also the reader's. */
   choose(networks) {
     this.memoryTop ??= this.engine.memory.top;
     this.engine.memory.top = this.memoryTop; // the earlier cars and networks are forgotten

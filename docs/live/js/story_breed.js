@@ -49,8 +49,10 @@ stad.figure("breed", async (part) => {
     part("flag").setAttribute("aria-valuetext", `generation ${generations[i]}`);
     const points = planted ? `, ${facts.returns[i].toFixed(0)} points` : "";
     const lap = planted ? (facts.laps[i] ? ", a complete lap" : ", no complete lap") : "";
-    stad.describe(part("map"), `recorded drives of the start and 24 generations; generation ${generations[i]}${points}${lap}`); // prettier-ignore
-    if (planted) part("summary").textContent = `Generation ${generations[i]}${points}${lap}.`;
+    const told = `${generations[i]}${points}${lap}`;
+    const drives = "recorded drives of the start and 24 generations";
+    stad.describe(part("map"), `${drives}; generation ${told}`);
+    if (planted) part("summary").textContent = `Generation ${told}.`;
     draw();
   }
 
@@ -60,7 +62,8 @@ stad.figure("breed", async (part) => {
     if (planted) return;
     planted = true;
     const guess = generations[chosen()];
-    const text = `You said ${guess}: the first complete lap on this track is in generation ${generations[first]}.`;
+    const lap = `the first complete lap on this track is in generation ${generations[first]}`;
+    const text = `You said ${guess}: ${lap}.`;
     part("answer").textContent = text;
     part("plant").setAttribute("aria-disabled", "true");
     part("play").disabled = false;

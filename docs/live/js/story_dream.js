@@ -103,7 +103,9 @@
         else one.apart ??= now; // a slow device draws fewer frames than it dreams
         if (one.apart !== null && now - one.apart >= LASTING - 1) one.diverged = one.apart;
       });
-      const told = dreams.map(({ diverged }) => (diverged === null ? "still together" : `diverged after ${stad.seconds(diverged)} s`)); // prettier-ignore
+      const told = dreams.map(({ diverged }) =>
+        diverged === null ? "still together" : `diverged after ${stad.seconds(diverged)} s`,
+      );
       told.forEach((text, i) => stad.setText(part(`told-${i + 1}`), text));
       const time = stad.seconds(dreams[0].dream.frames);
       part("time").textContent = `${time} s with closed eyes`;
@@ -117,10 +119,11 @@
     function settle() {
       const middle = dreams.map(({ diverged }) => diverged ?? Infinity).sort((a, b) => a - b)[1];
       const answer = BOUNDS.filter((bound) => middle > bound).length;
+      const end = stad.seconds(dreams[0].dream.frames);
       const told =
         middle < Infinity
           ? `the middle one of the three diverged after ${stad.seconds(middle)} seconds.`
-          : `two of the three were still together after ${stad.seconds(dreams[0].dream.frames)} seconds, when they ended.`; // prettier-ignore
+          : `two of the three were still together after ${end} seconds, when they ended.`;
       const text = `${bet.choice === answer ? "Right" : "No"}: ${told}`;
       part("answer").textContent = text;
       stad.announce(text);

@@ -31,9 +31,12 @@ stad.figure("hairpin", async (part) => {
     const tile = lost[0]?.tile;
     const apart = tile === undefined ? Infinity : Math.abs(tile - mark);
     const near = Math.min(apart, track.count - apart) < 20;
-    const text = tile === undefined
-      ? `It stayed on the road, with ${car.score.toFixed(0)} points.`
-      : `${near ? "You found it" : "Elsewhere"}: the car first left the road after ${stad.seconds(lost[0].frame)} seconds, at the first red dot. ${car.score.toFixed(0)} points.`; // prettier-ignore
+    const points = `${car.score.toFixed(0)} points.`;
+    let text = `It stayed on the road, with ${points}`;
+    if (tile !== undefined) {
+      const left = `the car first left the road after ${stad.seconds(lost[0].frame)} seconds`;
+      text = `${near ? "You found it" : "Elsewhere"}: ${left}, at the first red dot. ${points}`;
+    }
     part("answer").textContent = text;
     stad.announce(text);
     part("race").hidden = false;

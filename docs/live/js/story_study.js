@@ -14,12 +14,16 @@ stad.figure("study", async (part) => {
     const x = (points) => 8 + ((width - 16) * (points - LOW)) / (HIGH - LOW);
     context.fillStyle = "rgba(128, 128, 128, 0.28)"; // seen in both themes
     context.fillRect(x(-margin), 0, x(margin) - x(-margin), height - 22);
-    for (const end of [-margin, margin])
-      stad.strokeLine(context, [[x(end), 0], [x(end), height - 22]], "#8a8a8a", 1); // prettier-ignore
-    stad.strokeLine(context, [[x(0), 0], [x(0), height - 22]], ink, 1); // prettier-ignore
+    const mark = (points, colour) => {
+      const line = [0, height - 22].map((y) => [x(points), y]);
+      stad.strokeLine(context, line, colour, 1);
+    };
+    mark(-margin, "#8a8a8a");
+    mark(margin, "#8a8a8a");
+    mark(0, ink);
     if (shown) {
       context.setLineDash([5, 4]);
-      stad.strokeLine(context, [[x(paper), 0], [x(paper), height - 22]], ink, 1); // prettier-ignore
+      mark(paper, ink);
       context.setLineDash([]);
     }
     context.fillStyle = ink;
@@ -33,7 +37,8 @@ stad.figure("study", async (part) => {
       context.fillText(name, 8, y - 24);
       if (!shown) return;
       for (const one of pairs) stad.fillDot(context, [x(one), y + 16], 3.5, "#8a8a8a");
-      stad.strokeLine(context, interval.map((end) => [x(end), y]), stad.COLORS.blue, 4); // prettier-ignore
+      const ends = interval.map((end) => [x(end), y]);
+      stad.strokeLine(context, ends, stad.COLORS.blue, 4);
       stad.fillDot(context, [x(difference), y], 7, stad.COLORS.blue);
     });
   }
@@ -42,8 +47,11 @@ stad.figure("study", async (part) => {
   stad.bet(part("bets"), names, () => {
     shown = true;
     draw();
-    const found = rows.map(({ name, difference, interval }) => `${name}: ${difference.toFixed(1)} points (95% interval ${interval.map((end) => end.toFixed(1)).join(" to ")})`).join(". "); // prettier-ignore
-    const text = `${found}. The paper: ${paper} points`;
+    const told = rows.map(({ name, difference, interval }) => {
+      const [low, high] = interval.map((end) => end.toFixed(1));
+      return `${name}: ${difference.toFixed(1)} points (95% interval ${low} to ${high})`;
+    });
+    const text = `${told.join(". ")}. The paper: ${paper} points`;
     part("answer").textContent =
       "Hardly any, on average. If it sees z alone it is more: see below.";
     stad.describe(part("chart"), text);
