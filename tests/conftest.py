@@ -239,14 +239,10 @@ def firefox(tmp_path):
 
 @pytest.fixture
 def interrupt_after():
-    """A function that raises KeyboardInterrupt after so many updates of a training.
-
-    It returns a handle with a method `remove`.
-    """
+    """A context in which a training is interrupted after so many updates, and must end by it."""
     from torch.optim.optimizer import register_optimizer_step_post_hook
 
-    handles = []
-
+    @contextmanager
     def interrupt(updates):
         left = [updates]
 
@@ -255,12 +251,14 @@ def interrupt_after():
             if left[0] == 0:
                 raise KeyboardInterrupt
 
-        handles.append(register_optimizer_step_post_hook(count))
-        return handles[-1]
+        hook = register_optimizer_step_post_hook(count)
+        try:
+            with pytest.raises(KeyboardInterrupt):
+                yield
+        finally:
+            hook.remove()
 
-    yield interrupt
-    for handle in handles:
-        handle.remove()
+    return interrupt
 
 
 @pytest.fixture(scope="session")

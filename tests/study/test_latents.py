@@ -81,10 +81,8 @@ def test_an_interrupted_study_continues_to_the_same_numbers(measured, reduced, i
     first = reduced_predictions(*reduced)
     kept = (measured / "one_Gaussian" / "mdn_rnn.safetensors").stat().st_mtime_ns
     shutil.rmtree(measured / "no_memory")
-    hook = interrupt_after(11)  # between two checkpoints
-    with pytest.raises(KeyboardInterrupt):
+    with interrupt_after(11):  # between two checkpoints
         reduced_predictions(*reduced)
-    hook.remove()
     assert list(measured.glob("no_memory/*.training.safetensors"))
     again = reduced_predictions(*reduced)
     assert all(np.array_equal(first[name], again[name]) for name in REDUCED)

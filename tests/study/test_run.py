@@ -147,10 +147,8 @@ def test_an_evaluation_that_is_lost_or_of_another_controller_is_made_again(cause
 def test_an_interrupted_experiment_continues_to_the_same_result(made, tmp_path, interrupt_after):
     # In the first V, in the second one (6 + 4 updates are left of the first V and M), in driving.
     for updates in (3, 6 + 4 + 3):
-        handle = interrupt_after(updates)
-        with pytest.raises(KeyboardInterrupt):
+        with interrupt_after(updates):
             run("two", tmp_path, seeds=[0])
-        handle.remove()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(evaluation, "drive_group", interrupted)
         with pytest.raises(KeyboardInterrupt):
