@@ -48,8 +48,8 @@ def launch(playwright: Playwright) -> Browser:
     return playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
 
 
-def measure(folder: Path) -> dict[str, list[float]]:
-    """Driver -> frames a second of each round, in a page in this folder."""
+def measure(folder: Path) -> dict:
+    """The browser, and of each driver the frames a second in each round; a page in this folder."""
     live_build.write_scripts(folder)
     tags = "".join(f'<script src="js/{name}.js"></script>' for name in SCRIPTS)
     (folder / "index.html").write_text(f"<!doctype html><title>speed</title>{tags}", "utf-8")

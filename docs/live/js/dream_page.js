@@ -73,8 +73,10 @@ stad.start(async () => {
     const count = dream.frames;
     if (count && from + count < drive.length && distances.at(-1)?.[0] !== count) {
       distances.push([count, stad.rmsDistance(shown.frame, frame)]);
-      const last = distances.slice(-LASTING);
-      if (diverged === null && last.length === LASTING && last.every(([, one]) => one > level)) {
+      // A slow device draws fewer frames than it dreams.
+      const last = distances.filter(([when]) => when > count - LASTING);
+      const apart = count >= LASTING && last.every(([, one]) => one > level);
+      if (diverged === null && apart) {
         diverged = last[0][0];
         stad.announce(`Dream and episode have diverged, ${diverged} frames after the eyes closed.`);
       }
@@ -304,7 +306,6 @@ stad.start(async () => {
   });
 
   // The drive plays at once; V and M are loaded and read it meanwhile.
-  get("play").disabled = false;
   draw();
   showCharts();
   setPlaying(untouched);
@@ -320,7 +321,6 @@ stad.start(async () => {
     throw error;
   });
   encoded = new stad.EncodedEpisode(vae, mdnRnn, drive);
-  get("eyes").disabled = false;
   stad.page = {
     drive,
     vae,

@@ -35,8 +35,6 @@ stad.LONGEST = 1000; // frames of an episode
     const pool = [0, 1, 2, 3].map((i) => mixed(entropy[i] ?? 0));
     for (let from = 0; from < 4; from++)
       for (let to = 0; to < 4; to++) if (from !== to) pool[to] = mix(pool[to], mixed(pool[from]));
-    for (const word of entropy.slice(4))
-      for (let to = 0; to < 4; to++) pool[to] = mix(pool[to], mixed(word));
     let other = 0x8b51f9dd;
     const words = Array.from({ length: 8 }, (_, i) => {
       let value = (pool[i % 4] ^ other) >>> 0;

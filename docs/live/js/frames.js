@@ -84,12 +84,23 @@ stad.Drive = class {
     return this.actions.subarray(3 * t, 3 * t + 3);
   }
 
-  /** Load a drive, `data/NAME.js` and `data/NAME_picture.js`. */
-  static async load(name = "drive") {
-    const [facts, url] = await Promise.all([stad.load(name), stad.load(`${name}_picture`)]);
+  /** Load the recorded drive. */
+  static async load() {
+    const [facts, url] = await Promise.all([stad.load("drive"), stad.load("drive_picture")]);
     const bytes = await stad.decodeBase64(facts.actions);
     return new stad.Drive(await stad.readPicture(url), facts, new Float32Array(bytes.buffer));
   }
+};
+
+/** Recorded places; `frameOf(place, speed, stride)`: now if the speed is 0, or some frames ago. */
+stad.loadSpeeds = async () => {
+  const { places, speeds, strides } = await stad.load("speeds");
+  const sheet = await stad.readPicture(await stad.load("speeds_picture"));
+  const columns = 1 + speeds.length * strides.length; // of the picture; a row for each place
+  const film = new stad.Drive(sheet, { frames: places * columns, columns }, new Float32Array(0));
+  const column = (speed, stride) => (speed === 0 ? 0 : 1 + (speed - 1) * strides.length + stride);
+  const frameOf = (place, speed, stride) => film.frame(place * columns + column(speed, stride));
+  return { places, speeds, strides, frameOf };
 };
 
 {

@@ -23,6 +23,7 @@ stad.start(async () => {
   }
 
   function stopWave() {
+    if (wave.running) renewMap(); // the first latent has moved
     wave.pause();
     get("wave").textContent = "Move the slider";
   }
@@ -50,8 +51,6 @@ stad.start(async () => {
     if (mine !== choice) return; // the reader has chosen another one meanwhile
     [variant, vae] = [name, loaded];
     buildSliders();
-    await stad.pause();
-    if (mine !== choice) return;
     encode();
     stad.announce(`V is now ${name}.`);
     stad.recover();
@@ -253,6 +252,7 @@ stad.start(async () => {
     ["up", 1],
   ])
     get(id).addEventListener("change", ({ target }) => {
+      stopWave();
       const other = get(id === "up" ? "across" : "up");
       if (target.value === other.value) other.value = axes[1 - place] = axes[place]; // they swap
       axes[place] = Number(target.value);

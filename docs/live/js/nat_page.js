@@ -7,9 +7,9 @@ stad.start(async () => {
   const size = stad.FRAME_SIZE;
   const rows = [
     { name: "frames", row: 0, original: true },
-    { name: "reconstructed from z", row: 0 },
+    { name: "frames reconstructed from z", row: 0 },
     { name: "difference images", row: 1, original: true },
-    { name: "reconstructed from z", row: 1 },
+    { name: "difference images reconstructed from z", row: 1 },
   ];
   let chosen = found.findIndex((one) => one.kl_weight === 0.25);
 

@@ -174,11 +174,10 @@ stad.Clock = class {
 /**
  * Do small pieces of work one after another while the page stays responsive.
  * @param {() => boolean} work one piece; returns false when all is done
- * @param {number} slice milliseconds of work between two pauses
  */
-stad.inBackground = async (work, slice = 8) => {
+stad.inBackground = async (work) => {
   for (let going = true; going;) {
-    const end = performance.now() + slice;
+    const end = performance.now() + 8; // milliseconds between two pauses
     while (going && performance.now() < end) going = work();
     await stad.pause();
   }

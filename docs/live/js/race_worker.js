@@ -51,7 +51,7 @@ stad.Race = class {
     this.phase = "waiting"; // "attract": the agent drives alone; "race"; "paused"; "over"
     this.resting = false; // no car drives before the race while nobody sees it
     this.steps = 0;
-    [this.pedals, this.easy] = [[], true];
+    [this.pedals, this.gamepad, this.easy] = [[], null, true];
   }
 
   async load({ code, facts, tables }) {
@@ -117,10 +117,13 @@ stad.Race = class {
 
   /** Pedals that are down; who drives the easy way gets gas up to a speed, a lower one in bends. */
   press(speed) {
-    const steers = this.pedals.some((one) => one === "left" || one === "right");
+    const { gamepad } = this;
+    const turned = Math.abs(gamepad?.[0] ?? 0) > 0.5; // a stick is seldom quite straight
+    const steers = turned || this.pedals.some((one) => one === "left" || one === "right");
     const fast = this.easy && speed > (steers ? 40 : 60);
     const down = this.pedals.filter((one) => !(fast && one === "gas"));
     this.hand.held = new Map(down.map((pedal, i) => [i, pedal]));
+    this.hand.gamepad = gamepad && [gamepad[0], fast ? 0 : gamepad[1], gamepad[2]];
   }
 
   /** The reader's episode is over: the agent's is driven to its end at once. */
@@ -190,13 +193,13 @@ if (typeof WorkerGlobalScope !== "undefined" && self instanceof WorkerGlobalScop
     pedals: ({ held, gamepad, easy }) => {
       race.easy = easy;
       race.pedals = held;
-      race.hand.gamepad = gamepad;
+      race.gamepad = gamepad;
     },
   };
   let last = Promise.resolve(); // one after the other: the engine may still be compiling
   onmessage = ({ data }) => {
     last = last
       .then(() => acts[data.type](data))
-      .catch((error) => postMessage({ type: "error", text: String(error.stack ?? error) }));
+      .catch((error) => postMessage({ type: "error", text: String(error.message ?? error) }));
   };
 }

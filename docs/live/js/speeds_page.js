@@ -3,21 +3,15 @@
 // image, and sees one place at all three speeds.
 
 stad.start(async () => {
-  const { places, speeds: moving, strides } = await stad.load("speeds");
-  const sheet = await stad.readPicture(await stad.load("speeds_picture"));
+  const { places, speeds: moving, strides, frameOf: recorded } = await stad.loadSpeeds();
   const speeds = [0, ...moving];
-  const columns = 1 + moving.length * strides.length; // of the picture; a row for each place
-  const film = new stad.Drive(sheet, { frames: places * columns, columns }, new Float32Array(0));
   const names = ["It is parked", `It drives at ${moving[0]}`, `It races at ${moving[1]}`];
   const score = { frame: { right: 0, all: 0 }, difference: { right: 0, all: 0 } };
   const round = { place: 4, truth: 0, bet: null, sight: "frame" };
   let stride = 2; // its number in `strides`
 
   /** A frame of a place: the present one, or that of a speed some frames ago. */
-  function frameOf(place, speed = 0) {
-    const column = speed === 0 ? 0 : 1 + (speed - 1) * strides.length + stride;
-    return film.frame(place * columns + column);
-  }
+  const frameOf = (place, speed = 0) => recorded(place, speed, stride);
 
   const differenceOf = (speed) =>
     stad.differenceImage(frameOf(round.place), frameOf(round.place, speed));

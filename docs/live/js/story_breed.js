@@ -11,7 +11,6 @@ stad.figure("breed", async (part) => {
   const [road, paths] = stad.readPaths(tensors, 0, facts.points);
   const first = facts.laps.indexOf(true);
   let [moment, planted, wanted] = [0, false, !stad.prefersStill()];
-  const STEPS = 5; // frames between two points of a path
   const chosen = () => Number(part("flag").value);
 
   const clock = new stad.Clock(
@@ -36,8 +35,8 @@ stad.figure("breed", async (part) => {
     stad.strokeLine(context, driven, stad.COLORS.blue, 2);
     stad.fillDot(context, place(at(chosen())), 8, "white");
     stad.fillDot(context, place(at(chosen())), 6, stad.COLORS.blue);
-    part("time").textContent =
-      `${Math.min(20, (moment * STEPS) / stad.FRAMES_A_SECOND).toFixed(0)} s`;
+    const frames = moment * run.every; // a path has a point every so many
+    part("time").textContent = `${Math.min(20, frames / stad.FRAMES_A_SECOND).toFixed(0)} s`;
   }
 
   /** Pale for early generations, dark for late ones. */

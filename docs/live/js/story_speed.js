@@ -2,19 +2,13 @@
 // "How fast?": three bets on one frame, three with the difference image, then the reader's own.
 
 stad.figure("speed", async (part) => {
-  const { places, speeds, strides } = await stad.load("speeds");
-  const sheet = await stad.readPicture(await stad.load("speeds_picture"));
-  const columns = 1 + speeds.length * strides.length;
-  const film = new stad.Drive(sheet, { frames: places * columns, columns }, new Float32Array(0));
+  const { places, speeds, strides, frameOf: recorded } = await stad.loadSpeeds();
   const [BLIND, ALL] = [3, 6]; // bets on one frame, and all bets
   const names = ["It is parked", ...speeds.map((speed) => `Speed ${speed}`)];
   const right = [0, 0]; // bets won: on one frame, and with the difference image
   let [round, stride, truth] = [0, 2, 0];
 
-  const frameOf = (speed) => {
-    const column = speed === 0 ? 0 : 1 + (speed - 1) * strides.length + stride;
-    return film.frame((round % places) * columns + column);
-  };
+  const frameOf = (speed) => recorded(round % places, speed, stride);
   const again = stad.bet(part("bets"), names, (choice) => {
     const kind = round < BLIND ? 0 : 1;
     right[kind] += Number(choice === truth);
