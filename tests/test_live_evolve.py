@@ -107,6 +107,24 @@ def test_the_latest_few_evolutions_are_kept_and_a_link_goes_on_with_its_own(open
     page.wait_for_function("stad.page.log.length === 0")
     page.evaluate("location.hash = location.hash.replace('seed=5', 'seed=3')")
     page.wait_for_function("stad.page.log.length === 1")
+    page.evaluate("location.hash = 'population=24'")  # the others are the page's own
+    page.wait_for_function("document.querySelector('#population').value === '24'")
+
+
+KEEP = """() => {
+    const [latest] = stad.evolveSettings.all
+    const changed = [...latest.log.slice(0, -1), { ...latest.log.at(-1), checksum: "another" }]
+    const kept = [latest.log.slice(0, -1), changed, latest.log].map((log) => {
+        stad.evolveSettings.keep({ ...latest, log })
+        return stad.evolveSettings.all[0].log.at(-1).checksum
+    })
+    return [latest.log.at(-1).checksum, ...kept]
+}"""
+
+
+def test_another_tab_that_is_behind_in_an_evolution_takes_no_generation_from_it(evolved):
+    latest, *kept = evolved.evaluate(KEEP)
+    assert kept == [latest, "another", latest]
 
 
 def test_a_driver_from_the_page_scores_the_same_in_python(evolved, tmp_path):

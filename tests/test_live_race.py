@@ -138,6 +138,17 @@ def test_the_easy_way_gives_no_gas_above_60_until_it_is_switched_off(opened):
     page.wait_for_function("stad.page.state.you.pose.speed > 70")
 
 
+def test_the_easy_way_holds_for_a_gamepad_too(opened):
+    page = opened("race", reduced_motion="reduce")
+    page.evaluate(GAMEPAD)
+    page.evaluate("trigger.value = 1")
+    page.wait_for_function("stad.page.state.action[1] === 1")
+    page.wait_for_function("stad.page.state.you.frames > 200")
+    assert 50 < page.evaluate("stad.page.state.you.pose.speed") < 70  # its wheels spin on
+    page.uncheck("#easy")
+    page.wait_for_function("stad.page.state.you.pose.speed > 80")
+
+
 def test_closed_eyes_show_the_dream_while_the_car_drives_on(opened):
     page = opened("race")
     page.keyboard.down("ArrowUp")
@@ -187,7 +198,10 @@ def test_a_finger_steers_with_gas_by_itself(opened):
         assert page.evaluate(top, point) == "race"
 
 
-def test_a_lap_with_the_autopilot_is_no_record_of_the_reader(opened):
+ANOTHER_TAB = "localStorage.setItem('stad-race', '{\"7\": 900}')"  # has driven meanwhile
+
+
+def test_a_lap_with_the_autopilot_is_no_record_and_a_record_leaves_those_of_other_tabs(opened):
     page = opened("race", "#track=5&agent=input_output")
     page.keyboard.down("ArrowUp")
     phase(page, "race")
@@ -197,11 +211,15 @@ def test_a_lap_with_the_autopilot_is_no_record_of_the_reader(opened):
     page.keyboard.down("ArrowUp")
     page.wait_for_selector("#live[data-phase=over]", timeout=60_000)
     assert page.evaluate("localStorage.getItem('stad-race')") is None
+    page.evaluate(ANOTHER_TAB)
     assert "autopilot" in page.inner_text("#card")
     page.wait_for_timeout(1600)  # a key that is still down begins nothing by chance
     page.keyboard.up("ArrowUp")
     page.keyboard.down("ArrowUp")  # the button for the autopilot had the focus
     page.wait_for_function("!stad.page.state.helped && stad.page.state.phase === 'race'")
+    page.wait_for_selector("#live[data-phase=over]", timeout=60_000)
+    kept = page.evaluate("JSON.parse(localStorage.getItem('stad-race'))")
+    assert kept["7"] == 900 and "5" in kept
 
 
 CLICK_ALL = "(one) => one.querySelectorAll('button').forEach((button) => button.click())"

@@ -98,6 +98,7 @@ stad.start(async () => {
     [log, states, upcoming, finished, saved] = [kept?.log ?? [], found, next, null, 0];
     view.begin(track, settings.population + 1, "");
     stad.evolveSettings.show(settings);
+    if (!kept) stad.evolveSettings.drop(settings);
     show();
     if (wanted > 0) go(wanted); // an impatient reader has pressed Start meanwhile
   }

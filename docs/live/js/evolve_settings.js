@@ -45,7 +45,8 @@ stad.evolveSettings = {
 
   /** Whether the address names settings, and not just a place on the page. */
   get asked() {
-    return location.hash.includes("seed=");
+    const asked = new URLSearchParams(location.hash.slice(1));
+    return this.NAMES.some((name) => asked.has(name));
   },
 
   fromAddress() {
@@ -71,21 +72,39 @@ stad.evolveSettings = {
     }
   },
 
-  /** Keep an evolution in the place of an earlier one with the same settings. */
+  /** The kept evolution with these settings, and the others. */
+  split(settings) {
+    const same = (one) => this.equal(settings, one.settings);
+    return [this.all.find(same), this.all.filter((one) => !same(one))];
+  },
+
+  /** Keep an evolution in the place of one with the same settings. */
   keep(state) {
-    const others = this.all.filter(({ settings }) => !this.equal(settings, state.settings));
+    const [before, others] = this.split(state.settings);
+    const count = state.log.length;
+    const ahead = // in another tab
+      before?.log.length > count && before.log[count - 1]?.checksum === state.log.at(-1)?.checksum;
+    this.store([ahead ? before : state, ...others]);
+  },
+
+  /** Forget the evolution with these settings. */
+  drop(settings) {
+    this.store(this.split(settings)[1]);
+  },
+
+  /** Keep the first of these; when the storage is full, fewer, and without it none. */
+  store(evolutions) {
     for (let count = this.LATEST; count > 0; count--)
       try {
-        const latest = [state, ...others].slice(0, count);
-        return localStorage.setItem(this.KEY, JSON.stringify(latest));
+        return localStorage.setItem(this.KEY, JSON.stringify(evolutions.slice(0, count)));
       } catch {
-        // when the storage is full, fewer are kept, and without it none is
+        // try with fewer
       }
   },
 
   /** The evolution that was kept with the settings in the address, or the latest one. */
   kept() {
     if (!this.asked) return this.all[0];
-    return this.all.find(({ settings }) => this.equal(this.fromAddress(), settings));
+    return this.split(this.fromAddress())[0];
   },
 };

@@ -62,7 +62,7 @@ stad.start(async () => {
   }
 
   function receive(message) {
-    if (message.type === "error") return stad.fail(new Error(message.text.split("\n")[0]));
+    if (message.type === "error") return stad.fail(new Error(message.text));
     if (message.type === "track") {
       track = stad.prepareRoad(message.track);
       return;
@@ -190,6 +190,9 @@ stad.start(async () => {
 
   /** The reader's best on this track; a lap with the autopilot is none. */
   function recordOf(mine, helped) {
+    // Another tab may have driven, too.
+    for (const [track, score] of Object.entries(readBest()))
+      best[track] = Math.max(score, best[track] ?? score);
     const record = !helped && mine > (best[seed] ?? -Infinity);
     if (record) {
       best[seed] = mine;
