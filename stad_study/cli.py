@@ -226,7 +226,7 @@ COMMANDS: dict[str, Callable] = {
     "benchmark": benchmark,
     "ship": ship,
 }
-CONTINUES = ("replicate", "evaluate", "probe", "latents")
+CONTINUES = ("replicate", "probe", "latents")
 PROGRAM = command_line.Program(
     "python -m stad_study", "Repeat what the replication ran.", COMMANDS, CONTINUES
 )

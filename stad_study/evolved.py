@@ -40,8 +40,8 @@ from stad_study.study import (
     claimed,
     fixed_threads,
     groups_of,
-    refuse_repeated,
     select,
+    without_finished,
 )
 
 CHECKSUMS = ("log", "controller", "returns")
@@ -120,13 +120,15 @@ def run_evolved(
 
     After an interruption the same call continues. A run that another process does is left to it, so
     several processes may share a folder; each computes on one thread. With `only`, runs that the
-    tables have are run, too, and compared. ValueError as `find_runs`, and for a folder with a
-    recorded run that `only` names.
+    tables have are run, too, and compared. ValueError as `find_runs`, and if the folder
+    already has all that `only` names, and the tables, too.
     """
     root = Path(folder) / study.name
-    asked = find_runs(study, seeds, only, to) if only else []
-    refuse_repeated(root, [run for run in asked if recorded(study, run, to)])
     tried: set[str] = set()
+    if only:
+        asked = find_runs(study, seeds, only, to)
+        left = without_finished(root, asked, lambda run: recorded(study, run, to))
+        tried = {run.name for run in asked} - {run.name for run in left}
     # What is found may grow with the tables: a gate decides what follows it.
     while runs := [run for run in find_runs(study, seeds, only, to) if run.name not in tried]:
         tried.add(runs[0].name)

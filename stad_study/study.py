@@ -14,7 +14,7 @@ run, unless one is asked for by its name: then it is compared with what the tabl
 
 import contextlib
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -140,14 +140,15 @@ def select(
     study: str, runs: list[AnyRun], seeds: Sequence[int] | None, only: Sequence[str] | None
 ) -> list[AnyRun]:
     """Those of some seeds, or some by name. ValueError for an unknown seed or name."""
-    planned, names = {run.seed for run in runs}, [run.name for run in runs]
+    planned = {run.seed for run in runs}
     if other := set(seeds or ()) - planned:
         known = f"{min(planned)} to {max(planned)}"
         raise ValueError(f"study {study!r} has no seed {min(other)}: it has {known}")
+    chosen = [run for run in runs if not seeds or run.seed in seeds]
+    names = [run.name for run in chosen]
     if unknown := [name for name in only or [] if name not in names]:
         example = f"expected a name such as {names[0]!r}"
         raise ValueError(f"study {study!r} has no run {unknown[0]!r}: {example}")
-    chosen = [run for run in runs if not seeds or run.seed in seeds]
     return [run for run in chosen if not only or run.name in only]
 
 
@@ -165,11 +166,12 @@ def run_study(
     left to it, so several processes may run a study in the same folder. With `only`, pipelines that
     the tables have are run, too, and compared with the tables instead of added.
 
-    Raises ValueError as `find_pipelines`, and for a folder with a recorded pipeline that `only`
-    names; and what `train` raises.
+    Raises ValueError as `find_pipelines`, and if the folder already has all that `only` names, and
+    the tables, too; and what `train` raises.
     """
     wanted, root = find_pipelines(study, seeds, only), Path(folder) / study
-    refuse_repeated(root, [one for one in wanted if only and recorded(one, to)])
+    if only:
+        wanted = without_finished(root, wanted, lambda one: recorded(one, to))
     for seed, variant in dict.fromkeys((one.seed, one.variant) for one in wanted):
         own = [one for one in wanted if (one.seed, one.variant) == (seed, variant)]
         if not only and not unfinished(own, to):
@@ -203,12 +205,19 @@ def claimed(folder: Path) -> Iterator[bool]:
         yield ours
 
 
-def refuse_repeated(root: Path, runs: Sequence[Run]) -> None:
-    """ValueError if one of these runs, which are to be repeated, is finished in its folder."""
-    for folder in (root / run.name for run in runs):
-        if (folder / SCORE).exists():
-            remedy = "give an empty folder with --out to repeat it"
-            raise ValueError(f"{folder} has the recorded run: {remedy}")
+def without_finished(
+    root: Path, runs: list[AnyRun], known: Callable[[AnyRun], dict | None]
+) -> list[AnyRun]:
+    """Runs that are asked for by name, but for those in the tables that `root` has, too.
+
+    `known` is the line of a run in the tables, or None. ValueError if none is left: a finished run
+    would be compared with itself.
+    """
+    left = [run for run in runs if not ((root / run.name / SCORE).exists() and known(run))]
+    if not left:
+        remedy = "give an empty folder with --out to repeat it"
+        raise ValueError(f"{root / runs[0].name} has the recorded run: {remedy}")
+    return left
 
 
 def unfinished(pipelines: list[Pipeline], to: Path) -> list[Pipeline]:

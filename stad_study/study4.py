@@ -44,8 +44,8 @@ from stad_study.study import (
     claimed,
     drive_tracks,
     fixed_threads,
-    refuse_repeated,
     select,
+    without_finished,
 )
 
 NAME = "study4"
@@ -93,11 +93,12 @@ def run_study4(
 
     After an interruption the same call continues. A run that another process does is left to it;
     each computes on one thread. With `only`, recorded runs are run, too, and compared. ValueError
-    as `find_runs`, for a folder with a recorded run that `only` names, and at the end for runs that
-    failed: a run of hours does not wait for another's mistake.
+    as `find_runs`, if the folder already has all that `only` names, and the tables, too, and at the
+    end for runs that failed: a run of hours does not wait for another's mistake.
     """
     root, wanted, failed = Path(folder) / NAME, find_runs(seeds, only), []
-    refuse_repeated(root, [run for run in wanted if only and recorded(run, to)])
+    if only:
+        wanted = without_finished(root, wanted, lambda run: recorded(run, to))
     for run in wanted:
         try:
             do_run(run, root, to, repeat=bool(only))

@@ -240,6 +240,7 @@ def test_kept_agents_are_driven_on_any_tracks_by_one_command(made, tmp_path, mon
     [
         (["study1", "--seeds", "12"], "study 'study1' has no seed 12: it has 0 to 11"),
         (["study1", "--only", "seed0/frame"], "study 'study1' has no run 'seed0/frame'"),
+        (["study1", "--seeds", "1", "--only", "seed0/frame/z"], "has no run 'seed0/frame/z'"),
         (["no_bar_frame", "--only", "seed0/frame/z"], "'no_bar_frame' is no study"),
         (["study1", "--keep"], "--keep is for earlier experiments"),
     ],

@@ -129,6 +129,9 @@ def test_a_repeated_run_is_compared_with_the_recorded_one(made, networks, tmp_pa
     assert "bit-identical" in capsys.readouterr().out
     with pytest.raises(ValueError, match="has the recorded run: give an empty folder"):
         run_evolved(STUDY5, tmp_path, only=only, to=made / "data", networks=networks)
+    another = f"{name}/z_+_motion/1"  # as after an interrupt between the two
+    run_evolved(STUDY5, tmp_path, only=[*only, another], to=made / "data", networks=networks)
+    assert f"{another}: bit-identical" in capsys.readouterr().out
     (run,) = find_runs(STUDY5, only=only)
     was = recorded(STUDY5, run, made / "data") | {"returns": "other"}
     assert compare_run(run, was, tmp_path / "study5").startswith("differs in returns: mean ")
