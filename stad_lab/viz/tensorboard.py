@@ -7,16 +7,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from stad_lab.agent import load_agent
+from stad_lab.envs.frames import normalise
 from stad_lab.evaluation.trajectories import (
     MOTION,
     Trajectory,
     encode_trajectory,
     record_trajectory,
 )
-from stad_lab.io.weights import CONTROLLER_FILE, VAE_FILE, load_vae
+from stad_lab.io.weights import CONTROLLER_FILE, WorldModel
+from stad_lab.models.vae import to_tensor
 from stad_lab.training.evolution import fitness_curves
 from stad_lab.viz.video import FILM, film_agent
 
@@ -63,13 +64,12 @@ class TensorBoard:
 
     def add_agent(self, folder: Path) -> None:
         """Add the film of a run's agent and the latents of its episode, if there is an agent."""
-        there = (folder / CONTROLLER_FILE).exists()
-        if not there and not self.written:
-            return  # or earlier curves would be erased for nothing
-        if there:
+        if not self.written:
+            return  # no stage has told anything: earlier curves would be erased for nothing
+        if (folder / CONTROLLER_FILE).exists():
             agent = load_agent(folder)
             self.add_film("agent", film_agent(agent, **FILM))
-            self.add_latents(folder, record_trajectory(agent, FILM["track"], FRAMES))
+            self.add_latents(agent.world_model, record_trajectory(agent, FILM["track"], FRAMES))
         self.writer.close()
 
     def add_film(self, name: str, gif: bytes) -> None:
@@ -80,12 +80,11 @@ class TensorBoard:
         summary = Summary(value=[Summary.Value(tag=name, image=image)])
         self.writer._get_file_writer().add_summary(summary)  # add_video would need moviepy
 
-    def add_latents(self, folder: Path, trajectory: Trajectory) -> None:
+    def add_latents(self, world_model: WorldModel, trajectory: Trajectory) -> None:
         """Add z of each frame, with the frame and the car's motion, to the *Projector*."""
-        vae, metadata = load_vae(folder / VAE_FILE)
-        mu, _ = encode_trajectory(vae, trajectory, metadata["vae"]["stride"], metadata["crop_bar"])
-        frames = torch.from_numpy(trajectory.frames(metadata["crop_bar"]))
-        pictures = frames.permute(0, 3, 1, 2).float() / 255
+        vae, _, stride, crop_bar, _ = world_model
+        mu, _ = encode_trajectory(vae, trajectory, stride, crop_bar)
+        pictures = to_tensor(normalise(trajectory.frames(crop_bar)))
         motion = [[f"{value:.2f}" for value in row] for row in trajectory.motion]
         names = list(MOTION)
         self.writer.add_embedding(mu, motion, pictures, metadata_header=names, tag="z")
