@@ -34,7 +34,9 @@ def with_preset(arguments: list[str]) -> tuple[dict[str, Callable], list[str]]:
     return COMMANDS | {"train": training_command(Config.preset(preset))}, others
 
 
-FLAGS = ("--tensorboard", "--data.crop-bar", "--data.no-crop-bar")  # options without a value
+FLAGS = (  # options without a value
+    "-h", "--help", "--tensorboard", "--no-tensorboard", "--data.crop-bar", "--data.no-crop-bar",
+)  # fmt: skip
 
 
 def take_preset(arguments: list[str]) -> tuple[str | None, list[str]]:
@@ -44,7 +46,8 @@ def take_preset(arguments: list[str]) -> tuple[str | None, list[str]]:
     """
     for place, (before, one) in enumerate(itertools.pairwise(arguments), 1):
         first = place == 1 and not one.startswith("-")
-        takes_value = before.startswith("-") and "=" not in before and before not in FLAGS
+        option = before.startswith("-") and "=" not in before
+        takes_value = option and before.replace("_", "-") not in FLAGS
         if first or (one in PRESETS and not takes_value):
             return one, [*arguments[:place], *arguments[place + 1 :]]
     return None, arguments
