@@ -63,8 +63,8 @@ def squash(raw: np.ndarray) -> np.ndarray:
 
 def check_parameters(parameters: np.ndarray, count: int, source: object = "controller") -> None:
     """Raise ValueError unless the parameters are finite, (count,) or (cars, count)."""
-    if not isinstance(parameters, np.ndarray) or parameters.dtype.kind not in "fiu":
-        raise ValueError(f"{source}: expected parameters as an array of numbers")
+    if not isinstance(parameters, np.ndarray) or parameters.dtype.kind != "f":
+        raise ValueError(f"{source}: expected parameters as an array of floats")
     if parameters.ndim not in (1, 2) or parameters.shape[-1] != count:
         raise ValueError(
             f"{source}: parameters of shape {parameters.shape}, expected ({count},) or"

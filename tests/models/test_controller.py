@@ -90,3 +90,8 @@ def test_parameters_of_another_size_are_refused():
     message = r"shape \(123,\), expected \(867,\) or \(cars, 867\).*another size"
     with pytest.raises(ValueError, match=message):
         check_parameters(random_parameters(1)[0], 867)
+
+
+def test_parameters_that_are_whole_numbers_are_refused_because_z_and_h_would_be_cut_to_them():
+    with pytest.raises(ValueError, match="expected parameters as an array of floats"):
+        check_parameters(np.ones(867, int), 867)
