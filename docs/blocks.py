@@ -62,7 +62,7 @@ def table(head: Iterable[str], lines: Iterable[Iterable[str]]) -> str:
 
 def fixed(value: float) -> str:
     """Two decimals, and no negative zero."""
-    return f"{round(value, 2) + 0.0:.2f}"
+    return f"{value:z.2f}"
 
 
 # The replication

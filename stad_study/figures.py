@@ -198,7 +198,7 @@ def plot_drivers(study3: dict) -> Figure:
     figure = plot_intervals(panels, title, "R2 on unseen episodes", limits=(-0.2, 1.05))
     told = []
     for panel, rows in panels.items():
-        means = [f"{row} {round(one['from z'][0], 2) + 0.0:.2f}" for row, one in rows.items()]
+        means = [f"{row} {one['from z'][0]:z.2f}" for row, one in rows.items()]
         told.append(f"{panel}: {', '.join(means)}")
     return describe(figure, title, "Mean R2 from z. ", ["; ".join(told)])
 

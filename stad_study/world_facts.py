@@ -210,7 +210,7 @@ def describe_erasure(found: dict[str, dict[str, dict]]) -> str:
     lines = [f"{'R2 on held-out episodes':<24}{head}"]
     for driver, by_sight in found.items():
         for sees, one in by_sight.items():
-            numbers = "".join(f"{value + 0.0:14.2f}" for value in [*one["r2"], one["variance"]])
+            numbers = "".join(f"{value:z14.2f}" for value in [*one["r2"], one["variance"]])
             lines.append(f"{driver + ': ' + sees:<24}{numbers}")
     return "\n".join(lines)
 

@@ -141,6 +141,6 @@ def describe_probe(found: dict) -> str:
     for driver, by_features in found["drivers"].items():
         lines.append(f"  {driver:18s}" + "".join(f"{quantity:>16s}" for quantity in MOTION))
         for features, by_quantity in by_features.items():
-            cells = (f"{by_quantity[quantity]['r2'] + 0.0:16.2f}" for quantity in MOTION)
+            cells = (f"{by_quantity[quantity]['r2']:z16.2f}" for quantity in MOTION)
             lines.append(f"    {features:16s}" + "".join(cells))
     return "\n".join(lines)

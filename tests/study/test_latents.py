@@ -205,7 +205,7 @@ def test_the_command_probes_a_run_and_keeps_every_r2(quick_run, tmp_path, monkey
         assert driver in printed and list(by_features) == ["z", "z, h"]
         for r2s in by_features.values():
             assert list(r2s) == list(MOTION)
-            assert "".join(f"{one['r2'] + 0.0:16.2f}" for one in r2s.values()) in printed
+            assert "".join(f"{one['r2']:z16.2f}" for one in r2s.values()) in printed
             for one in r2s.values():
                 assert one["interval"][0] <= one["r2"] <= one["interval"][1] <= 1
     assert sorted(quick_run.iterdir()) == before
