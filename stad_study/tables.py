@@ -163,6 +163,7 @@ def add_speed(file: Path, to: Path = DATA) -> None:
     """Add what `python -m stad_study benchmark` wrote to the tables, in place of the same parts."""
     result = load_json(file, kind="benchmark")
     made_with, parts = result.pop("made_with"), result.keys() - {"kind", "rounds"}
+    made_with["commit"] = made_with["commit"] or "unknown"
     lines = []
     for part in parts:
         for measure, table in result[part].items():

@@ -93,7 +93,11 @@ def test_a_benchmark_takes_the_place_of_the_same_parts(tmp_path):
     assert after[after.part == "loop"].value.tolist() == [5.5, 1, 1, 2, 3]
     others = [table[table.part != "loop"].reset_index(drop=True) for table in (before, after)]
     assert others[0].equals(others[1])
-    made_with = tables.read("provenance", tmp_path)
-    line = made_with[(made_with.table == "speed") & (made_with.source == "loop")]
-    assert line.commit.tolist() == ["c0ffee"]
+    for commit, told in (("c0ffee", "c0ffee"), (None, "unknown")):  # outside a git checkout
+        result["made_with"]["commit"] = commit
+        save_json(tmp_path / "benchmark.json", result)
+        tables.add_speed(tmp_path / "benchmark.json", tmp_path)
+        made_with = tables.read("provenance", tmp_path)
+        line = made_with[(made_with.table == "speed") & (made_with.source == "loop")]
+        assert line.commit.tolist() == [told]
     assert {"run", "cluster"} <= set(made_with[made_with.table == "speed"].source)
