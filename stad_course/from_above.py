@@ -146,12 +146,11 @@ def plot_paths(
         paths: name -> (where the car was, world units (T, 2); whether the human drove, bool (T,)).
     """
     figure, axes = new_figure(max(3.4 * len(paths), 5.0), 3.9, 1, len(paths))
-    left, right = road_edges(road)
     points = np.concatenate([own for own, _ in paths.values()])
     low, high = points.min(axis=0), points.max(axis=0)
     middle, reach = (low + high) / 2, (high - low).max() / 2 + 2 * TRACK_WIDTH
     for axis, (name, (points, by_hand)) in zip(axes[0], paths.items(), strict=True):
-        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85")
+        fill_road(axis, road, color="0.85")
         drivers = ("agent", ~by_hand, BLUE, 4), ("by hand", by_hand, ORANGE, 12)
         for driver, shown, color, size in drivers:
             if shown.any():
@@ -179,9 +178,8 @@ def plot_road(
         reach: how far that panel extends to each side, world units.
     """
     figure, axes = new_figure(8.6, 4.3, 1, 2)
-    left, right = road_edges(road)
     for axis in axes[0]:
-        axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.85", label="road")
+        fill_road(axis, road, color="0.85", label="road")
         for (name, path), (color, dash) in zip(paths.items(), styles_of(paths), strict=False):
             axis.plot(*path.T, dash, color=color, lw=1.6, label=name)
             axis.plot(*path[-1], "x", color=color, ms=10, mew=2.5, zorder=5)
@@ -240,8 +238,7 @@ def plot_learning(generations: list[dict], total: int, title: str) -> Figure:
 
 def draw_map(axis: Axes, road: np.ndarray, paths: list[np.ndarray], returns: np.ndarray) -> None:
     """A lap from above with the path of each car: the best in ORANGE, the others in BLUE."""
-    left, right = road_edges(road)
-    axis.fill(*np.concatenate([left, right[::-1]]).T, color="0.87")
+    fill_road(axis, road, color="0.87")
     best = int(np.argmax(returns))
     for place, path in enumerate(paths):
         if place != best:
@@ -255,9 +252,9 @@ def draw_map(axis: Axes, road: np.ndarray, paths: list[np.ndarray], returns: np.
     axis.spines[:].set_visible(False)
 
 
-def road_edges(road: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Both edges of a lap, closed: centres of its tiles (tiles, 2) -> (tiles + 1, 2) each."""
+def fill_road(axis: Axes, road: np.ndarray, **style) -> None:
+    """Fill a lap from above; `road` has the centres of its tiles, world units (tiles, 2)."""
     along = np.roll(road, -1, axis=0) - np.roll(road, 1, axis=0)
     across = TRACK_WIDTH * along[:, ::-1] * (-1, 1) / np.linalg.norm(along, axis=1, keepdims=True)
     left, right = (np.concatenate([edge, edge[:1]]) for edge in (road + across, road - across))
-    return left, right
+    axis.fill(*np.concatenate([left, right[::-1]]).T, **style)

@@ -1,4 +1,4 @@
-"""What C sees in studies 2 and 5: z of a kept V, in study 5 also with motion added or taken out.
+"""What C sees in studies 2 and 5: z of a kept V, alone, with h, or with motion added or erased.
 
 The motion is three numbers that the simulator knows: slip speed, yaw rate and wheel angle. They are
 added to z after division by their standard deviation in the seed's dataset, or erased from z by the
@@ -77,7 +77,7 @@ def random_directions(white: Whitening, variance: float, rng: np.random.Generato
 
     They are drawn from a normal distribution whose covariance is a power of that of z: with power 0
     all directions are alike, with a larger one those of much variance are likelier. The power is
-    the least of 0, 1, 2 ... 8 whose draws exceed the variance at least once in ten; then the draw
+    the least of 0, 1, 2 ... 8 whose draws exceed the variance more than once in ten; then the draw
     nearest to the variance is taken.
     """
     size = len(white.mean)

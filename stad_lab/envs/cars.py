@@ -264,7 +264,7 @@ def check_seeds(seeds: Any, count: int) -> list[int | None]:
 
 
 def pose_on(
-    path: Sequence | np.ndarray, tile: int, turn: float = 0.0, offset: float = 0.0
+    path: Sequence | np.ndarray, tile: int, turn: float, offset: float
 ) -> tuple[float, float, float]:
     """Heading, x and y of a car that `Cars.place` puts on a tile of a track's centre line."""
     if not is_whole(tile):

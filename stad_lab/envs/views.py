@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pygame
 
-from stad_lab.envs.arguments import choice, shown
+from stad_lab.envs.arguments import choice, whole_number
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import BAR_TOP, OBSERVATION_SIZE
 from stad_lab.envs.state import STATE, observe_state
@@ -29,10 +29,7 @@ class View:
 
     def __init__(self, observes: str, size: int, bar: bool = True):
         choice("observes", observes, VIEWS)
-        low, high = SIZES
-        if not isinstance(size, int | np.integer) or not low <= size <= high:
-            raise ValueError(f"size={shown(size)}: expected {low} to {high} pixels")
-        self.observes, self.size, self.bar = observes, int(size), bar
+        self.observes, self.size, self.bar = observes, whole_number("size", size, *SIZES), bar
         self.window: Window | None = None
         self.space: gym.Space = gym.spaces.Box(0, 255, (self.size, self.size, 3), np.uint8)
         if observes == "state":

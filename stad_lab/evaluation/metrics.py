@@ -18,13 +18,12 @@ from stad_lab.models.vae import VAE, kl_divergence, to_array
 
 ACTIVE = 0.05  # nats; a latent with a smaller mean KL is called inactive
 CAR = (slice(50, 60), slice(29, 35))  # rows and columns of the car: the camera is fixed to it
-REGIONS = ("road", "grass", "car")
 
 
 def region_masks(frames: np.ndarray) -> dict[str, np.ndarray]:
     """Which pixels are road (with kerbs), grass (with what lies beyond the field) and car.
 
-    Frames uint8 (n, 64, 64, 3), without the indicator bar -> bool (n, 64, 64) for each of REGIONS.
+    Frames uint8 (n, 64, 64, 3), without the indicator bar -> bool (n, 64, 64) for each.
     """
     red, green = frames[..., 0].astype(np.int16), frames[..., 1].astype(np.int16)
     grass = (green - red > 30) | (green < 20) & (red < 20)
@@ -74,7 +73,7 @@ def vae_metrics(vae: VAE, frames: np.ndarray, earlier: np.ndarray) -> dict:
     Returns:
         A dict for JSON. "frame_error" and "difference_error" (None if not reconstructed) are
         squared errors summed over a picture, as in the loss; "blank_difference_error" is that of an
-        empty difference image. "regions" has for each of REGIONS its "share" of the pixels, its
+        empty difference image. "regions" has for each region its "share" of the pixels, its
         "error" (squared, of one pixel, summed over the colours), and "flat_error", that of the best
         single colour. "kl" is in nats, "kl_of_latents" of each, "active" counts those above ACTIVE.
     """

@@ -25,7 +25,7 @@ from stad_lab.io.weights import (
 )
 from stad_lab.io.workers import TaskError, run_in_order, worker_processes, worker_threads
 from stad_lab.training import evolution
-from stad_lab.training.dataset import MANIFEST, Dataset, check_seen, count_episodes
+from stad_lab.training.dataset import MANIFEST, Dataset, check_seen, count_episodes, load_manifest
 from stad_lab.training.mdn_rnn import check_mdn_rnn
 from stad_lab.training.record import (
     MACHINE,
@@ -115,7 +115,7 @@ def verify_dataset(folder: Path) -> str:
     """Check every file of the dataset against the manifest."""
     if not (folder / MANIFEST).exists():
         return MISSING
-    made, wanted = count_episodes(load_json(folder / MANIFEST, kind="dataset"))
+    made, wanted = count_episodes(load_manifest(folder / MANIFEST))
     if made < wanted:
         return f"none: {made} of {wanted} episodes so far"
     dataset = Dataset(folder)

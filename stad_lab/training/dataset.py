@@ -89,7 +89,7 @@ def drive_randomly(config: Config, index: int) -> Episode:
     """Drive episode `index` of the random driver. Runs in a worker."""
     cars, driver = random_start(config, index)
     pair = record_frames(driver, cars, max_frames=config.data.episode_frames)
-    return *pair, track_seeds("collect", config.data.episodes, config.seed)[index]
+    return *pair, cars.seeds[0]
 
 
 def record_frames(driver: Driver, cars: Cars, **limits) -> tuple[np.ndarray, np.ndarray]:

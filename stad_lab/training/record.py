@@ -20,7 +20,7 @@ from stad_lab.io.files import load_json, save_json
 from stad_lab.io.weights import VAE_FILE
 from stad_lab.io.workers import interrupted_at_the_end
 from stad_lab.training import second_iteration
-from stad_lab.training.dataset import MANIFEST, made_with
+from stad_lab.training.dataset import MANIFEST, load_manifest, made_with
 from stad_lab.training.evolution import LOG
 from stad_lab.training.trainer import training_device
 
@@ -203,7 +203,7 @@ def budget(config: Config, folder: Path, data: Path | None) -> dict:
     count = config.data.episodes
     again = config.data.agent_episodes > 0
     order = second_iteration.order_of_episodes(config) if again else range(count)
-    for entry in load_json(data / MANIFEST, kind="dataset")["episodes"] if data else ():
+    for entry in load_manifest(data / MANIFEST)["episodes"] if data else ():
         driver = "random" if order[entry["index"]] < count else "agent_driver"
         spent[driver].update(episodes=1, frames=entry["frames"])
     if (folder / LOG).exists():

@@ -33,7 +33,7 @@ from stad_lab.training.evolution import hand_out, make_agent
 from stad_lab.training.ridge import fit_ridge
 from stad_lab.training.subspace import START_FILE, load_start, save_start
 
-NOISE = 0.1  # mean standard deviation of the noise on steering and gas, in a frame
+NOISE = 0.1  # mean deviation of what each frame adds to the noise, whose own is 2.3 times that
 LIMIT = 2.5  # of C's outputs before squashing, as targets: tanh(2.5) is 0.987
 PENALTY = 0.01  # of the ridge regression, for each frame
 

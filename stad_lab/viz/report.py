@@ -70,10 +70,13 @@ def film(folder: Path) -> str:
 def curves_of(folder: Path) -> list[Figure]:
     """The losses of V and of M, and the returns and step sizes of CMA-ES, as far as they are."""
     figures = []
-    parts = {VAE_FILE: (load_vae, "V"), MDN_RNN_FILE: (load_mdn_rnn, "M")}
-    for name, (load, letter) in parts.items():
+    parts = {
+        VAE_FILE: (load_vae, "V", "squared error + weighted KL"),
+        MDN_RNN_FILE: (load_mdn_rnn, "M", "nats per latent"),
+    }
+    for name, (load, letter, unit) in parts.items():
         if (folder / name).exists() and (history := load(folder / name)[1].get("history")):
-            figures.append(plots.plot_history(history, f"The loss of {letter}", "nats"))
+            figures.append(plots.plot_history(history, f"The loss of {letter}", unit))
     if (folder / LOG).exists():
         generations = load_json(folder / LOG, kind="evolution")["generations"]
         if generations:

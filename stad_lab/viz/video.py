@@ -19,7 +19,7 @@ from stad_lab.viz.plots import difference_colors
 
 FILM = {"track": 5, "first": 60, "frames": 150}  # of a run, by `film_agent`: after the zoom
 EVERY = 3  # one of so many frames is shown, at the real speed
-DREAM = 100  # frames of an open-loop dream: two seconds
+DREAM = 100  # frames of a dream in which C drives: two seconds
 
 
 def animate_pictures(columns: dict[str, np.ndarray], fps: float = 25) -> bytes:
