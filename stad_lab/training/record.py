@@ -68,7 +68,7 @@ def open_record(config: Config, folder: Path, before: dict | None, made: dict) -
     """The record of the run in `folder`, or a new one that was made with `made`.
 
     "earlier" is `before`, the record of the run that this one continues. ValueError if the record
-    there is damaged, or V exists and its variant, seed or settings differ.
+    there is damaged, or V exists and its variant, seed, data or settings differ.
     """
     path = folder / RECORD
     new: dict[str, Any] = {"kind": "record", "variant": config.variant, "config": config.as_dict()}
@@ -77,7 +77,7 @@ def open_record(config: Config, folder: Path, before: dict | None, made: dict) -
         return {**new, "made_with": made, "seconds": {}, **earlier}
     record = load_json(path, kind="record")
     if (folder / VAE_FILE).exists():  # then its part of the configuration has not changed
-        fixed = {name: new["config"][name] for name in ("variant", "seed", "vae")}
+        fixed = {name: new["config"][name] for name in ("variant", "seed", "data", "vae")}
         check_same(path, record["config"], fixed)
     return record | new
 

@@ -185,6 +185,15 @@ def test_a_second_iteration_continues_only_with_the_agent_that_it_began_with(
         train(CONFIG, second, earlier=other)
 
 
+def test_a_second_iteration_into_a_run_of_a_first_one_is_refused_before_it_drives(
+    quick_run, tmp_path
+):
+    folder = copy_run(quick_run, tmp_path / "run")  # as one that shares another's dataset
+    with pytest.raises(ValueError, match=r"data.agent_episodes=0, now data.agent_episodes=3"):
+        train(QUICK.replace(data={"agent_episodes": 3}, processes=1), folder, earlier=quick_run)
+    assert not (folder / "dataset").exists()
+
+
 def test_the_episodes_of_another_agent_are_another_dataset(quick_run, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(second_iteration, "collect_episodes", lambda *given: made.append(given[1]))
