@@ -20,7 +20,6 @@ from stad_lab.io.weights import (
     MDN_RNN_FILE,
     VAE_FILE,
     load_controller,
-    load_vae,
     load_world_model,
 )
 from stad_lab.io.workers import TaskError, run_in_order, worker_processes, worker_threads
@@ -35,6 +34,7 @@ from stad_lab.training.record import (
     starts,
 )
 from stad_lab.training.subspace import search_space
+from stad_lab.training.vae import check_vae
 
 AGAIN = 3  # recorded episodes that are driven again
 # Bounds of what other rounding explains. One car in three may leave the road, so the median counts.
@@ -70,7 +70,7 @@ def verify(folder: str | Path, executor: Executor | None = None) -> dict[str, st
     checks: dict[str, tuple[Callable[[], str | None], tuple[str, ...]]] = {
         "record": (lambda: f"ok: {config.variant}", ()),
         "dataset": (lambda: verify_dataset(dataset), ()),
-        "V": (lambda: check_seen(vae, load_vae(vae)[1]["dataset"], dataset), (VAE_FILE,)),
+        "V": (lambda: check_seen(vae, check_vae(config, folder)["dataset"], dataset), (VAE_FILE,)),
         "M": (lambda: check_mdn_rnn(config, folder), (MDN_RNN_FILE,)),
         "log of CMA-ES": (lambda: verify_log(folder, config), (*models, log)),
         # A C that has lost its V or M fails.

@@ -11,7 +11,7 @@ from stad_lab.evaluation.evaluate import KIND, describe_agent, report
 from stad_lab.evaluation.verify import verify
 from stad_lab.io.files import load_json, save_json
 
-EVALUATION, LOG = "evaluation-run.json", "evolution.json"
+EVALUATION, LOG, RECORD = "evaluation-run.json", "evolution.json", "record.json"
 
 
 @pytest.fixture
@@ -76,7 +76,8 @@ LOGS = [
 @pytest.mark.parametrize(
     ("name", "change", "part", "message"),
     [(EVALUATION, change, "evaluations", message) for change, message in SUMMARIES]
-    + [(LOG, *edited) for edited in LOGS],
+    + [(LOG, *edited) for edited in LOGS]
+    + [(RECORD, lambda file: file["config"]["vae"].update(stride=2), "V", "vae.stride=4, now")],
 )
 def test_an_edited_file_fails(name, change, part, message, evaluated, check):
     edit(evaluated / name, change)
