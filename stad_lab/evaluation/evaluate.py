@@ -29,7 +29,7 @@ from stad_lab.io.weights import CONTROLLER_FILE, load_controller
 from stad_lab.io.workers import run_tasks, worker_processes, worker_threads
 from stad_lab.training.evolution import drive_group, hand_out
 from stad_lab.training.pipeline import RUN_FILES
-from stad_lab.training.record import provenance
+from stad_lab.training.record import MACHINE, PACKAGES, provenance
 
 MOST_EPISODES = 10_000  # a bootstrap of more would need more than 2 GB
 KIND, UNFINISHED = "evaluation", "unfinished evaluation"
@@ -71,10 +71,11 @@ def evaluate(
     models = {"vae": agent.vae, "mdn_rnn": agent.mdn_rnn}
     # Of V and M as they are loaded: a shipped agent's may be of lower precision.
     weights = {name: checksum_of_tensors(model.state_dict()) for name, model in models.items()}
-    asked = {**identity, "tracks": tracks, **weights}
     command = f"python -m stad_lab evaluate --agent {shlex.quote(str(source))}"
     command += f" --episodes {episodes} --first-track {first_track}{' --fast' * fast}"
     made_with = provenance(command)  # before the work: it fails where a package is half installed
+    asked = {**identity, "tracks": tracks, **weights}
+    asked |= {name: made_with[name] for name in (*MACHINE, *PACKAGES)}  # the result names one
     driven, seconds = read_unfinished(unfinished, asked)
     begin = time.perf_counter() - seconds
     missing = [track for track in tracks if str(track) not in driven]
@@ -98,7 +99,7 @@ def evaluate(
 def read_unfinished(file: Path | None, asked: dict) -> tuple[dict, float]:
     """What an interrupted evaluation has driven, track -> (return, frames), and its seconds.
 
-    Both are empty if there is no such file, or if it asked for another agent or other tracks.
+    Both are empty if there is no such file, or it is of another agent, machine or other tracks.
     """
     known = {}
     if file and file.exists():

@@ -136,7 +136,12 @@ def test_an_interrupted_evaluation_continues_with_the_tracks_that_are_left(
     assert untimed(evaluate(*asked, unfinished=file)) == untimed(fast)
     assert tasks == [1]
     begun = load_json(file)
-    for other in ({"controller": "of another C"}, {"vae": "of the same V, less precise"}):
+    for other in (
+        {"controller": "of another C"},
+        {"vae": "of the same V, less precise"},
+        {"processor": "of another machine"},
+    ):
+        assert other.keys() <= begun["asked"].keys()
         save_json(file, begun | {"asked": begun["asked"] | other})
         assert evaluate(*asked, unfinished=file)["episodes"] == fast["episodes"]
         assert tasks.pop() == 2
