@@ -238,7 +238,7 @@ def check_rules(
         if not isinstance(value, bool | np.bool_):
             raise ValueError(f"{name}={shown(value)}: expected True or False")
     number = isinstance(lap_complete_percent, int | float | np.number)
-    if not number or not 0 <= lap_complete_percent <= 1:
+    if isinstance(lap_complete_percent, bool) or not number or not 0 <= lap_complete_percent <= 1:
         raise ValueError(f"lap_complete_percent={shown(lap_complete_percent)}: expected 0 to 1")
 
 

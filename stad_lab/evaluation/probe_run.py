@@ -121,7 +121,7 @@ def probe_run(source: str | Path, count: int = PROBED, processes: int = 2) -> di
     if count < FEWEST_TRAJECTORIES:
         expected = f"expected at least {FEWEST_TRAJECTORIES}, to fit and measure on"
         raise ValueError(f"episodes={count}: {expected}")
-    made_with = provenance("python -m stad_lab probe --run ...")  # before the work
+    made_with = provenance(f"python -m stad_lab probe --run ... --episodes {count}")  # before work
     model = load_world_model(run_folder(source))
     drivers = two_drivers(random_trajectories(count, PROBE_SEED, processes), processes)
     encoder = encoder_of(model, {"z, h": model.mdn_rnn})

@@ -42,7 +42,8 @@ def scores(folder: Path) -> str:
     """The evaluations of this C, or what to do if there is none."""
     found = [one for one in evaluations_of(folder).values() if is_of_agent(one, folder)]
     if not found:
-        command = html.escape(f"python -m stad_lab evaluate --agent {shlex.quote(str(folder))}")
+        own = shlex.quote(str(folder.resolve()))  # a name alone may be a shipped agent's
+        command = html.escape(f"python -m stad_lab evaluate --agent {own}")
         return f"<p>Not evaluated yet: <code>{command}</code></p>"
     rows = {}
     for one in found:

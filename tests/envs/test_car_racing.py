@@ -207,7 +207,7 @@ def test_a_switch_that_is_no_bool_is_refused(name, fast):
         make_env(fast=fast, **{name: "no"})
 
 
-@pytest.mark.parametrize("share", [95, -0.1, np.nan])
+@pytest.mark.parametrize("share", [95, -0.1, np.nan, True])
 def test_a_share_of_a_lap_that_is_none_is_refused(share):
     with pytest.raises(ValueError, match=f"lap_complete_percent={share}: expected 0 to 1"):
         make_env(lap_complete_percent=share)
