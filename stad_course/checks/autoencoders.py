@@ -123,13 +123,13 @@ def active_latents(active: Callable) -> None:
 
 
 def silenced(silence: Callable) -> None:
-    """Two latents of two pictures, set to zero in a copy."""
-    z = torch.arange(1.0, 13.0).reshape(2, 6)
+    """Two latents of five pictures, set to zero in a copy."""
+    z = torch.arange(1.0, 31.0).reshape(5, 6)
     keep = torch.tensor([1.0, 0.0, 1.0, 1.0, 0.0, 1.0])
     mistakes = {
         "these latents were kept, and the others silenced: set the named ones to 0": z * (1 - keep),
         "you silenced pictures (rows): latents are columns, z[:, latents]": z
-        * torch.tensor([[1.0], [0.0]]),
+        * torch.tensor([[1.0], [0.0], [1.0], [1.0], [0.0]]),
         "nothing was silenced: assign 0 to z[:, latents] of the copy": z.clone(),
         "this is the mean of these pictures: the prior's mean is 0": z * keep
         + (1 - keep) * z.mean(0),

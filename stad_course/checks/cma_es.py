@@ -44,8 +44,7 @@ def weights_of_ranks(weights: Callable) -> None:
         if size % 2:
             even = np.log(half + 0.5) - np.log(ranks)
             mistakes["mu + 1/2 is (size + 1) / 2 for an even size only"] = even / even.sum()
-            more = right_weights(size + 1)
-            mistakes["mu was rounded up: it is size // 2"] = more
+            mistakes["mu was rounded up: it is size // 2"] = np.append(right, 0.0)
         check(what, found, right, mistakes, tolerance=1e-3)
 
 
