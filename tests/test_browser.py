@@ -205,11 +205,8 @@ def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(r
         tells("keys held: none")
     page.keyboard.down("w")
     tells("keys held: gas")
-    before, begin = page.evaluate("window.pictures"), time.monotonic()
-    time.sleep(2)
-    rate = (page.evaluate("window.pictures") - before) / (time.monotonic() - begin)
-    print(f"{rate:.1f} pictures a second arrive in the browser; load {os.getloadavg()[0]:.1f}")
-    assert rate > 5  # a busy machine is slow; the line above says how fast this one was
+    before = page.evaluate("window.pictures")
+    wait_for(lambda: page.evaluate("window.pictures") > before + 10, "ten pictures")
     page.keyboard.up("w")
     tells("keys held: none")
 
@@ -399,7 +396,7 @@ def test_the_stop_button_ends_a_live_training_in_one_line_and_the_cell_goes_on(r
     picture = page.locator(".jp-RenderedHTMLCommon img").first
     sees_another_picture(picture, lambda: None)
     page.locator(STOP).first.click()
-    stopped = page.get_by_text("stopped: nothing that was logged is lost")
+    stopped = page.get_by_text("stopped: run this cell again")
     stopped.wait_for(timeout=1000 * SLOW)
     drawn = generation(picture)
     page.locator(".jp-CodeCell .cm-content").click()

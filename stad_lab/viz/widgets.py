@@ -52,8 +52,8 @@ def explore(draw: Callable[..., Figure], **controls: ipywidgets.Widget) -> ipywi
 def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]], Figure]) -> bool:
     """Train in a notebook cell below a figure that follows the log.
 
-    The stop button ends the cell in one line instead of an error. What was logged is on the disk,
-    and the same cell run again continues from there.
+    The stop button ends the cell in one line instead of an error. If `train` keeps its log, as
+    `evolve` does on the disk, the same cell run again continues.
 
     Args:
         train: is given the `watch` of `evolution.evolve` or `train_vae`.
@@ -73,7 +73,7 @@ def watch_training(train: Callable[[Watch], object], draw: Callable[[list[dict]]
     try:
         train(update)
     except KeyboardInterrupt:
-        print("stopped: nothing that was logged is lost, run this cell again to go on")
+        print("stopped: run this cell again")
         return False
     return True
 
