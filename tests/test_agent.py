@@ -130,10 +130,11 @@ def test_reset_forgets_the_past(observations):
     assert np.array_equal(act_along(agent, observations[:8]), first)
 
 
-def test_reset_brings_every_car_back():
+def test_reset_brings_every_car_back(observations):
     agent = make_agent(cars=2)
     for _ in range(2):
-        assert drive(agent, [1, 2], max_frames=3).lengths.tolist() == [3, 3]
+        assert len(agent.act_batch(observations[:2])) == 2
+        agent.keep(np.array([1]))
         agent.reset()
 
 
@@ -190,7 +191,7 @@ print("drove")
 """
     (tmp_path / "script.py").write_text(script)
     command = [sys.executable, tmp_path / "script.py"]
-    process = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    process = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert process.stdout == "(64, 64, 3) frame\ndrove\n", process.stderr
 
 

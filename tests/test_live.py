@@ -1,6 +1,5 @@
 """The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
 
-import secrets
 import shutil
 import subprocess
 import time
@@ -42,14 +41,6 @@ def still_page(browser, live_pages):
     page.goto((live_pages / "dream.html").as_uri())
     page.wait_for_selector("#live[data-state=ready]")
     return page
-
-
-@pytest.fixture
-def rng():
-    """Other numbers in every run."""
-    seed = secrets.randbits(64)
-    print(f"seed {seed}")
-    return np.random.default_rng(seed)
 
 
 def some_frames(rng):

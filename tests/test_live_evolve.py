@@ -35,7 +35,7 @@ def evolve(page, generations):
 
 @pytest.fixture(scope="module")
 def running(browser, live_pages):
-    """A page after two small generations, which draws seldom, and its errors."""
+    """A page after a small generation, which draws seldom, and its errors."""
     page, errors = (
         browser.new_page(reduced_motion="reduce", viewport={"width": 800, "height": 500}),
         [],

@@ -1,7 +1,6 @@
 """The live pages on speeds, the KL weight and evolution: opened from the disk in a Chromium."""
 
 import json
-import secrets
 import sys
 from pathlib import Path
 
@@ -74,9 +73,9 @@ def pycma(start, sigma, normals):
     [(6, 2, 15, "rosenbrock"), (13, 2, 15, "rastrigin"), (24, 2, 15, "ellipse"), (6, 99, 7, "")],
 )
 def test_cma_es_agrees_with_pycma_on_the_same_random_numbers(
-    opened, population, dimensions, generations, name
+    opened, rng, population, dimensions, generations, name
 ):
-    page, rng = opened("evolution"), np.random.default_rng(secrets.randbits(64))
+    page = opened("evolution")
     normals = rng.standard_normal((generations, population, dimensions))
     start, sigma = rng.uniform(-2, 2, dimensions).tolist(), float(rng.uniform(0.2, 1))
     found = page.evaluate(
@@ -126,19 +125,19 @@ def test_a_recorded_path_is_what_its_controller_drives():
     np.testing.assert_allclose(places[:: facts["every"]], recorded, atol=0.3)  # of half precision
 
 
-def test_the_frames_of_the_speeds_are_those_that_the_engine_draws():
+def test_the_frames_of_the_speeds_are_those_that_the_engine_draws(rng):
     cars = Cars(1, "frame", bar=False)
     cars.reset([record_speeds.TRACK])
-    place = secrets.randbelow(record_speeds.PLACES)
+    place = int(rng.integers(record_speeds.PLACES))
     sheet = np.asarray(Image.open(LIVE / "data" / "speeds.webp"))
     row = sheet[64 * place : 64 * (place + 1)].astype(int)
     assert np.abs(row - record_speeds.place_row(cars, place)).mean() < 0.1
 
 
-def test_the_dream_of_a_generation_begins_as_in_python(opened):
+def test_the_dream_of_a_generation_begins_as_in_python(opened, rng):
     page, agent = opened("evolution"), load_agent("cropped_input")
     tensors = live_build.load_file(LIVE / "data" / "evolution_tensors.safetensors")
-    chosen = secrets.randbelow(len(tensors["controllers"]))
+    chosen = int(rng.integers(len(tensors["controllers"])))
     found = page.evaluate(
         """async (chosen) => {
             const tensors = await stad.loadTensors("evolution_tensors");
@@ -246,8 +245,8 @@ def test_pictures_and_numbers_follow_the_kl_weight(opened):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_page_fits_a_phone_and_bears_impatient_clicks(opened, name):
-    page, rng = opened(name), np.random.default_rng(secrets.randbits(64))
+def test_a_page_fits_a_phone_and_bears_impatient_clicks(opened, rng, name):
+    page = opened(name)
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
     page.evaluate(
         """(order) => {

@@ -6,7 +6,7 @@ from stad_lab.agent import PRETRAINED, drive, load_agent, shipped_agents
 from stad_lab.config import TRACK_RANGES, VARIANTS, Config
 from stad_lab.evaluation.evaluate import load_evaluation
 from stad_lab.io.files import checksum_of_arrays, load_json
-from stad_lab.io.weights import load_mdn_rnn, load_vae, load_world_model
+from stad_lab.io.weights import load_mdn_rnn, load_vae
 from stad_lab.training.evolution import fitness_curves
 from stad_lab.training.record import processor
 
@@ -116,7 +116,3 @@ def test_the_older_agent_without_the_bar_scores_alike_with_either_renderer():
     tracks = [[one["track"] for one in found["episodes"]] for found in (gymnasium, fast)]
     assert tracks[0] == tracks[1]
     assert abs(gymnasium["mean"] - fast["mean"]) < 15
-
-
-def test_a_world_model_is_read_once_for_all_its_users():
-    assert load_world_model(PRETRAINED / "frame") is load_world_model(PRETRAINED / "frame")

@@ -4,8 +4,6 @@ On Linux x86-64 every number must be equal to the last bit. On other platforms c
 libraries round differently, so there only the first frames are compared, within a tolerance.
 """
 
-import copy
-import pickle
 import platform
 from concurrent.futures import ThreadPoolExecutor
 
@@ -253,21 +251,3 @@ def test_a_batch_equals_single_cars_on_any_number_of_threads():
         several, same_rewards = drive(threads)
         assert np.array_equal(rewards, same_rewards)
         assert np.array_equal(one.cars, several.cars)
-
-
-def test_cars_can_be_copied_and_pickled():
-    cars = Cars(2)
-    cars.reset([1, 2])
-    cars.step(np.full((2, 3), 0.3))
-    copies = [copy.deepcopy(cars), pickle.loads(pickle.dumps(cars))]
-    for other in [cars, *copies]:
-        other.step(np.array([[0.1, 0.5, 0], [1, 0, 0.2]]))
-        assert np.array_equal(other.cars, cars.cars)
-
-
-@pytest.mark.parametrize("action", [[np.nan, 0, 0], [0, np.inf, 0], [0, 0]])
-def test_actions_that_are_no_three_finite_numbers_are_refused(action):
-    cars = Cars(1)
-    cars.reset([0])
-    with pytest.raises(ValueError, match="expected finite numbers"):
-        cars.step(np.array([action]))

@@ -81,10 +81,14 @@ def test_the_rollouts_of_a_stopped_pool_of_threads_end_within_a_frame():
 
 
 def test_threads_leave_the_number_of_threads_of_torch_as_it_was():
-    before = torch.get_num_threads()
-    with worker_threads(2) as executor:
-        list(run_tasks(executor, single_thread, [(), ()]))
-    assert torch.get_num_threads() == before
+    torch.set_num_threads(2)  # the tasks set it to 1, for all threads that come later
+    try:
+        with worker_threads(2) as executor:
+            list(run_tasks(executor, single_thread, [(), ()]))
+        with ThreadPoolExecutor(1) as later:
+            assert later.submit(torch.get_num_threads).result() == 2
+    finally:
+        torch.set_num_threads(1)
 
 
 def test_an_executor_that_never_answers_ends_in_an_error():
@@ -130,8 +134,9 @@ def test_ctrl_c_ends_the_tasks_at_whatever_moment_it_comes(tmp_path):
 
 
 def test_a_task_that_is_cancelled_from_outside_is_an_error_with_its_remedy():
+    busy = threading.Event()
     with ThreadPoolExecutor(1) as executor:
-        executor.submit(time.sleep, 0.2)  # keeps it busy, so that the next one can be cancelled
+        executor.submit(busy.wait, 10)  # keeps it busy, so that the next one can be cancelled
         submit = executor.submit
 
         def submit_and_cancel(*task):
@@ -142,6 +147,7 @@ def test_a_task_that_is_cancelled_from_outside_is_an_error_with_its_remedy():
         executor.submit = submit_and_cancel
         with pytest.raises(TaskError, match="sleep was cancelled, as when a scheduler"):
             list(run_tasks(executor, time.sleep, [(1,)]))
+        busy.set()
 
 
 def test_on_windows_there_are_as_many_processes_as_it_can_wait_for(monkeypatch):
@@ -221,7 +227,7 @@ if __name__ == "__main__":
     PRELOADED.clear()  # which takes long, and is needed for nothing here
     with worker_processes(1) as executor:
         list(run_tasks(executor, time.sleep, [(0,)]))  # now a worker has started
-        tasks = run_tasks(executor, time.sleep, [(0.3,)], patience=2)
+        tasks = run_tasks(executor, time.sleep, [(1.0,)], patience=2)
         print("begun", flush=True)
         print(list(tasks))
 """
@@ -267,6 +273,7 @@ def test_workers_end_when_the_process_that_started_them_is_killed(tmp_path):
 def test_a_run_that_was_suspended_for_longer_than_its_patience_continues(tmp_path):
     with start_script(tmp_path, SUSPENDED) as process:
         assert process.stdout.readline() == "begun\n"
+        time.sleep(0.5)  # now it waits for the task
         os.killpg(process.pid, signal.SIGSTOP)
         time.sleep(2.6)
         os.killpg(process.pid, signal.SIGCONT)

@@ -177,13 +177,6 @@ def test_a_soft_bound_keeps_to_its_range_and_has_a_gradient_outside():
     assert (value.grad > 0.01).all()  # a clamp has 0 outside
 
 
-def test_a_logvar_outside_its_range_still_learns():
-    vae = make_vae("frame")
-    vae.encoder[-1].bias.data[32:] = 10.5
-    vae_losses(vae, *make_batch())["total"].backward()
-    assert (vae.encoder[-1].bias.grad[32:] != 0).all()
-
-
 def test_reconstruct_decodes_the_mean_and_repeats_itself():
     vae = make_vae("input_output")
     frame, difference, _ = make_batch()

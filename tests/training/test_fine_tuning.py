@@ -100,7 +100,9 @@ def test_a_finished_run_is_not_fine_tuned_in_place(quick_run, tmp_path):
     assert {path: path.read_bytes() for path in run.iterdir()} == before
 
 
-def test_an_interrupted_fine_tuning_continues_to_the_same_bits(tuned, quick_run, tmp_path):
+def test_a_fine_tuning_that_is_made_longer_equals_a_long_one_bit_for_bit(
+    tuned, quick_run, tmp_path
+):
     assert tune(quick_run, tmp_path / "run", {"generations": 1})
     assert tune(quick_run, tmp_path / "run")
     for name in (C, "start.safetensors"):
