@@ -132,6 +132,14 @@ def compare_episode(in_page, seed, frames):
     assert found["pictures"] == expected["pictures"]
 
 
+def test_the_return_in_the_page_has_the_loss_of_100_points_beyond_the_field(page):
+    straight_on = np.tile([0.0, 0.5, 0.0], (1000, 1))
+    rewards = drive(3, straight_on)["rewards"]
+    assert rewards[-1] == -100
+    page.evaluate(DRIVE, [3, straight_on.tolist(), []])
+    assert page.evaluate("car.score") == sum(rewards)
+
+
 def compare_agent(in_page, name, seed, frames):
     """A shipped agent drives in the page; Python computes its z, h and actions again."""
     found, score, driven = in_page(ACT, [name, seed, frames])

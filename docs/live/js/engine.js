@@ -312,7 +312,7 @@ stad.LONGEST = 1000; // frames of an episode
       memory.write(this.tiles, track.tiles);
       const count = BigInt(track.count);
       this.engine.call("start", this.car, this.road, this.path, this.tiles, count);
-      this.painted = false;
+      [this.painted, this.score] = [false, 0]; // the return so far
     }
 
     /** Drive one frame of 1/50 second: steering -1 to 1, gas and brake 0 to 1; the reward. */
@@ -320,7 +320,9 @@ stad.LONGEST = 1000; // frames of an episode
       const { memory, engine } = this;
       memory.read(Float64Array, this.action, 3).set(action);
       engine.call("step", this.car, this.road, engine.first, this.action, this.reward);
-      return memory.read(Float64Array, this.reward, 1)[0];
+      const [reward] = memory.read(Float64Array, this.reward, 1);
+      this.score += reward; // the engine's own sum lacks the -100 beyond the field
+      return reward;
     }
 
     field(name, Kind, count) {
@@ -334,11 +336,6 @@ stad.LONGEST = 1000; // frames of an episode
 
     get frames() {
       return this.field("frames", Int32Array, 1)[0];
-    }
-
-    /** The return so far. */
-    get score() {
-      return this.field("reward", Float64Array, 1)[0];
     }
 
     get tilesVisited() {
