@@ -127,7 +127,7 @@ stad.start(async () => {
     get("bar-steering").style.transform = `scaleX(${steering})`;
     get("bar-gas").style.transform = `scaleX(${gas})`;
     get("bar-brake").style.transform = `scaleX(${brake})`;
-    const [turn, press, stop] = [steering, gas, brake].map((pedal) => pedal.toFixed(1));
+    const [turn, press, stop] = [steering, gas, brake].map((pedal) => stad.fixed(pedal, 1));
     const pedals = `steering ${turn}, gas ${press}, brake ${stop}`;
     stad.describe(get("real"), `recorded episode, frame ${t} of ${drive.length}`);
     const distance = distances.at(-1)?.[1].toFixed(2);

@@ -81,20 +81,20 @@ stad.start(async () => {
     }
     if (mine !== starts) return;
     const own = ++run;
-    [settings, paused] = [chosen, null];
+    paused = null;
     await crew.stop();
     await before;
     if (own !== run) return;
-    identity = loaded.identity;
     await crew.callAll("choose", loaded.networks);
     if (own !== run) return;
-    const inputs = INPUTS[settings.sees];
-    const found = await crew.lead("evolve", { settings, inputs, log: kept?.log ?? [] });
+    const inputs = INPUTS[chosen.sees];
+    const found = await crew.lead("evolve", { settings: chosen, inputs, log: kept?.log ?? [] });
     const next = await crew.lead("ask");
     const track = await crew.lead("track", { seed: next.tracks[0] });
     if (own !== run) return;
     if (kept) bet = kept.bet ?? null;
     else if (log.length) bet = null; // it was on that evolution
+    [settings, identity] = [chosen, loaded.identity];
     [log, states, upcoming, finished, saved] = [kept?.log ?? [], found, next, null, 0];
     view.begin(track, settings.population + 1, "");
     stad.evolveSettings.show(settings);
@@ -239,9 +239,10 @@ stad.start(async () => {
   );
   addEventListener("hashchange", () => {
     if (!stad.page) return location.reload(); // it has not started
-    const asked = stad.evolveSettings.fromAddress();
-    if (stad.evolveSettings.asked && !stad.evolveSettings.equal(asked, wished))
-      open().catch(stad.fail);
+    const { asked } = stad.evolveSettings;
+    const same = stad.evolveSettings.equal(stad.evolveSettings.fromAddress(), wished);
+    if (asked && !same) open().catch(stad.fail);
+    else if (asked) get("answer").textContent ||= stad.evolveSettings.ignored(location.hash);
   });
 
   await open();

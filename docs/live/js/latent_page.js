@@ -110,7 +110,7 @@ stad.start(async () => {
     z[i] = value;
     const { range, value: number } = sliders.get(i);
     range.value = value;
-    number.textContent = value.toFixed(2);
+    number.textContent = stad.fixed(value, 2);
   }
 
   /** Encode the present frame, and take its z. */
@@ -197,7 +197,7 @@ stad.start(async () => {
     set(axes[0], bound(across));
     set(axes[1], bound(up));
     show();
-    stad.announce(`z[${axes[0]}] ${z[axes[0]].toFixed(2)}, z[${axes[1]}] ${z[axes[1]].toFixed(2)}`);
+    stad.announce(axes.map((i) => `z[${i}] ${stad.fixed(z[i], 2)}`).join(", "));
   }
 
   const map = get("map");

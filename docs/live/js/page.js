@@ -114,6 +114,9 @@ stad.quieten = (root) => {
   for (const one of root.querySelectorAll("output")) one.setAttribute("aria-live", "off");
 };
 
+/** A number with so many decimals, and no negative zero. */
+stad.fixed = (value, digits = 0) => value.toFixed(digits).replace(/^-(?=[0.]*$)/, "");
+
 /** Whether the reader has asked the system for less motion: then nothing moves by itself. */
 stad.prefersStill = () => matchMedia("(prefers-reduced-motion: reduce)").matches;
 

@@ -221,8 +221,10 @@
     if (event.ctrlKey || event.altKey || event.metaKey) return; // Alt+Left goes back
     const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
     const move = moves[event.key];
-    if (move) begin(start[0] + 0.05 * move[0], start[1] + 0.05 * move[1]);
-    else if (event.key === "Enter" || event.key === " ") stepAloud();
+    if (move) {
+      begin(start[0] + 0.05 * move[0], start[1] + 0.05 * move[1]);
+      stad.announce(`The start is at ${strategy.mean.map((one) => one.toFixed(2)).join(", ")}.`);
+    } else if (event.key === "Enter" || event.key === " ") stepAloud();
     else return;
     event.preventDefault(); // arrow keys and the space bar would move the page
   });

@@ -109,9 +109,9 @@ stad.start(async () => {
 
   function tell() {
     const { you, rival, phase } = state;
-    const mine = phase === "attract" ? "0" : you.score.toFixed(0);
+    const mine = phase === "attract" ? "0" : stad.fixed(you.score);
     set("your-score", mine);
-    set("rival-score", rival.score.toFixed(0));
+    set("rival-score", stad.fixed(rival.score));
     const time = phase === "attract" ? rival.frames : you.frames;
     set("time", `${stad.seconds(time)} s`);
     const driven = Math.round(100 * you.tiles);
@@ -121,7 +121,7 @@ stad.start(async () => {
       attract: `The ${name} drives ${where}. To race it, touch the picture or press the up arrow.`,
       race: `You race ${where}: ${driven}% of the lap, ${mine} points.`,
       paused: `Paused at ${driven}% of the lap.`,
-      over: `The race is over: you ${mine}, the agent ${rival.score.toFixed(0)} points.`,
+      over: `The race is over: you ${mine}, the agent ${stad.fixed(rival.score)} points.`,
     }[phase];
     stad.describe(get("race"), text);
   }
@@ -190,6 +190,7 @@ stad.start(async () => {
 
   /** The reader's best on this track; a lap with the autopilot is none. */
   function recordOf(mine, helped) {
+    const { seed } = track; // of this race: the reader may have wished for another one since
     // Another tab may have driven, too.
     for (const [track, score] of Object.entries(readBest()))
       best[track] = Math.max(score, best[track] ?? score);
@@ -263,7 +264,6 @@ stad.start(async () => {
   function setAuto(on) {
     worker.postMessage({ type: "autopilot", on });
     get("auto").setAttribute("aria-pressed", String(on));
-    set("auto", on ? "Drive yourself" : "Autopilot");
   }
 
   function wake() {
@@ -384,7 +384,8 @@ stad.start(async () => {
 
   /** The reader has changed the address. */
   function followAddress() {
-    if (!location.hash.includes("track=")) return; // another place of the page
+    if (!/[#&](track|agent|driver)=/.test(location.hash)) return; // another place of the page
+    if (!stad.page) return location.reload(); // it has not started
     const asked = readAddress();
     const [theirs, ours] = [asked.driver, driver].map((one) => stad.packDriver(one ?? []));
     // An evolved driver belongs to one V, and to the list of rivals.

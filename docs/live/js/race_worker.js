@@ -175,6 +175,7 @@ stad.Race = class {
   }
 
   closeEyes(closed) {
+    if (!closed) this.you.agent.past = []; // the frames before now were not seen
     if (this.you.frame || !closed) this.you.asleep = closed;
   }
 };
