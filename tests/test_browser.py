@@ -364,6 +364,11 @@ def test_keys_that_are_held_when_an_episode_ends_do_not_edit_the_notebook(seat):
     page.keyboard.up("d")
     page.keyboard.press("p")
     wait_for(lambda: not listening(page), "the end of the orange frame")
+    page.get_by_text("temperature, pace, track").click()
+    page.locator(".stad-lab-begin").click()
+    wait_for(lambda: listening(page), "the orange frame of the next episode")
+    page.keyboard.down("w")
+    reads("keys held: gas")
 
 
 # Training in the browser

@@ -43,7 +43,16 @@
     if (running()) go.click();
     update();
   }
-  function take() { escaped = false; update(); }
+  function take() { // also from another game, which keeps the keys after its episode
+    escaped = false;
+    window.dispatchEvent(new CustomEvent("stad-lab-take", { detail: seat }));
+    update();
+  }
+  window.addEventListener("stad-lab-take", ({ detail }) => {
+    if (detail === seat) return;
+    escaped = true;
+    update();
+  });
 
   window.addEventListener("keydown", (event) => {
     if (!listens() || event.ctrlKey || event.altKey || event.metaKey) return;
@@ -62,10 +71,12 @@
   document.addEventListener("visibilitychange", () => document.hidden && pause());
   document.addEventListener("focusin", () => typing() && running() && pause());
   picture.addEventListener("click", () => running() || go.click());
-  for (const name of [".stad-lab-drive", ".stad-lab-again"])
-    seat.querySelector(name).addEventListener("click", (event) => event.isTrusted && take());
+  const drives = ".stad-lab-drive, .stad-lab-again, .stad-lab-begin";
+  seat.addEventListener("click", ({ isTrusted, target }) =>
+    isTrusted && target.closest(drives) && take());
   picture.addEventListener("click", take);
-  new MutationObserver(take).observe(seat, { attributes: true, attributeFilter: ["class"] });
+  const changed = () => (seat.classList.contains("stad-lab-driving") ? take() : update());
+  new MutationObserver(changed).observe(seat, { attributes: true, attributeFilter: ["class"] });
 
   for (const pedal of Object.values(pedals)) {
     const button = seat.querySelector(`.stad-lab-${pedal}`);

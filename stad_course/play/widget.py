@@ -94,7 +94,7 @@ class Seat:
         self.temperature = ipywidgets.FloatSlider(temperature, min=0.1, max=2.5, step=0.05)
         self.speed = ipywidgets.IntSlider(FRAMES_A_SECOND, min=10, max=FRAMES_A_SECOND)
         self.track = ipywidgets.BoundedIntText(session.track, min=0, max=LAST_TRACK)
-        self.begin = ipywidgets.Button(description="begin", icon="flag")
+        self.begin = marked(ipywidgets.Button(description="begin", icon="flag"), "begin")
         self.again = marked(ipywidgets.Button(description="restart", icon="undo"), "again")
         self.wire = marked(ipywidgets.Text(), "wire")  # the held pedals, from keys.js
         self.swap = marked(ipywidgets.Button(), "swap")  # what keys.js clicks for T
