@@ -16,6 +16,7 @@ from stad_course.compete.process import (
     LARGEST_SUBMISSION,
     Failure,
     Submission,
+    can_isolate,
     files_of,
     size_of,
 )
@@ -43,9 +44,11 @@ def find_submissions(folder: Path) -> dict[str, Path]:
         raise ValueError(f"{folder} is no folder: expected one with submissions")
     found = {}
     for path in sorted(folder.iterdir()):
-        if path.name[0] in "._" or not (path.is_dir() or path.suffix == ".py"):
+        if path.name.startswith((".", "__")) or not (path.is_dir() or path.suffix == ".py"):
             continue
         name = path.name if path.is_dir() else path.stem
+        if not name.isprintable():  # such as bytes that are not UTF-8
+            raise ValueError(f"{str(path)!a} has a name that cannot be shown: rename it")
         if name in found:
             raise ValueError(f"{folder} has two submissions {name!r}: rename one")
         if name.startswith(BASELINE):
@@ -99,7 +102,7 @@ def check_conditions(file: Path, tracks: list[int], limits: Limits) -> None:
     A submission that was changed drives again; results under other conditions are not replaced.
     """
     if file.exists():
-        known = load_json(file, "delete it, to drive again", kind=KIND)
+        known = load_json(file, "drive again", kind=KIND)
         for name, asked in conditions(tracks, limits).items():
             if known.get(name) != asked:
                 found = f"{file} was driven with other {name}"
@@ -120,10 +123,11 @@ def drive_submission(
         "laps": {},
     }
     if file.exists():
-        known = load_json(file, "delete it, to drive again", kind=KIND)
+        known = load_json(file, "drive again", kind=KIND)
         if all(known.get(key) == value for key, value in asked.items()):
             result = known
     while (done := len(result["returns"])) < len(tracks):
+        result["isolated"] = can_isolate() and result.get("isolated", not done)
         drive_batch(path, tracks[done : done + BATCH], result, limits, hidden)
         save_json(file, result)
     return result

@@ -14,7 +14,7 @@ from stad_course.compete.drive import (
 )
 from stad_course.compete.limits import Limits
 from stad_course.compete.page import leaderboard
-from stad_course.compete.process import PACKAGE, can_isolate
+from stad_course.compete.process import PACKAGE
 from stad_course.compete.ranking import rank
 from stad_course.compete.tracks import load_tracks
 from stad_lab.io.files import locked, write_bytes
@@ -45,7 +45,8 @@ def run(
         table["baseline"] = table["name"].str.startswith(BASELINE)
         table["name"] = table["name"].str.removeprefix(BASELINE)
         seeds = secret.read_text(encoding="utf-8") if reveal else None
-        facts = {"isolated": can_isolate(), "revealed": seeds}
+        isolated = all(one.get("isolated") for one in results)
+        facts = {"isolated": isolated, "revealed": seeds}
         file = out / "leaderboard.html"
         write_bytes(file, leaderboard(table, tracks, commitment, facts).encode())
     return file

@@ -1,5 +1,6 @@
 """The competition: a submission costs itself alone, and a ranking can be continued and checked."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from stad_course.compete.drive import (
     STARTER,
     check_submission,
     drive_batch,
+    find_submissions,
     fingerprint,
 )
 from stad_course.compete.limits import Limits
@@ -26,7 +28,7 @@ from stad_course.compete.ranking import rank
 from stad_course.compete.tracks import hide_tracks
 from stad_lab.agent import PRETRAINED
 from stad_lab.envs.cars import Cars
-from stad_lab.io.files import load_json
+from stad_lab.io.files import load_json, save_json
 
 SHORT = ("--limits.start", "20", "--limits.step", "10")  # a busy machine is no fault
 HARMLESS = {"kills_itself"} if can_isolate() else set()  # the first process of a namespace cannot
@@ -111,6 +113,11 @@ def test_the_hash_is_known_before_the_seeds_and_the_page_holds_both_only_afterwa
     assert str(told["tracks"][0]) not in page.read_text(encoding="utf-8")
     hold(folder, 1, ("crash", "nan"), 2, *SHORT, "--no-baselines", "--reveal")
     assert str(told["tracks"][0]) in page.read_text(encoding="utf-8")
+    assert ("had no network" in page.read_text(encoding="utf-8")) == can_isolate()
+    result = folder / "out" / "results" / "student00.json"  # as driven where nothing is isolated
+    save_json(result, load_json(result) | {"isolated": False})
+    hold(folder, 1, ("crash", "nan"), 2, *SHORT, "--no-baselines")
+    assert "had no network" not in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.skipif(not can_isolate(), reason="this system starts no process in namespaces")
@@ -138,6 +145,33 @@ def test_a_submission_sees_neither_hidden_tracks_nor_other_processes_and_writes_
     with other, Submission(file, Limits(), hidden=(secret,)) as driver:
         driver.reset()
         assert driver.act_batch(np.zeros((1, 96, 96, 3), np.uint8)).tolist() == [[0, 0, 0]]
+
+
+def test_a_subclass_of_our_agent_drives_by_its_own_act_on_an_image_that_it_may_change(tmp_path):
+    file = tmp_path / "careful.py"
+    file.write_text(
+        "from stad_lab.agent import Agent, load_agent\n"
+        "class Careful(Agent):\n"
+        "    def act(self, observation):\n"
+        "        observation[84:] = 0\n"
+        "        return [0.25, 0.5, 0]\n"
+        "def make_agent():\n"
+        "    base = load_agent('frame')\n"
+        "    return Careful(base.world_model, base.parameters)\n"
+    )
+    with Submission(file, Limits(step=10.0)) as driver:
+        driver.reset()
+        assert driver.act_batch(np.zeros((1, 96, 96, 3), np.uint8)).tolist() == [[0.25, 0.5, 0]]
+
+
+def test_a_submission_may_have_any_name_that_can_be_shown(tmp_path):
+    for name in ("_ada.py", "Jürgen S.py", ".hidden.py", "__init__.py"):
+        (tmp_path / name).touch()
+    assert sorted(find_submissions(tmp_path)) == ["Jürgen S", "_ada"]
+    with contextlib.suppress(OSError):  # some systems refuse such a name
+        (tmp_path / os.fsdecode(b"J\xfcrgen.py")).touch()
+        with pytest.raises(ValueError, match="has a name that cannot be shown: rename it"):
+            find_submissions(tmp_path)
 
 
 def test_the_kit_passes_its_own_check():
