@@ -122,7 +122,8 @@ def check_python() -> Iterator[Line]:
     try:
         wanted = metadata("stad_lab")["Requires-Python"]
     except PackageNotFoundError:
-        yield Line(RED, "stad_lab", f"not installed for {sys.executable}", INSTALL)
+        found = f"not installed for {sys.executable}, Python {platform.python_version()}"
+        yield Line(RED, "stad_lab", found, f"with Python 3.11, 3.12 or 3.13: {INSTALL}")
         return
     yield Line(GREEN, "stad_lab", version("stad_lab"))
     found = platform.python_version().rstrip("+")  # a build from a branch: as good as the release
