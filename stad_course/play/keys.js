@@ -72,8 +72,10 @@
   document.addEventListener("focusin", () => typing() && running() && pause());
   picture.addEventListener("click", () => running() || go.click());
   const drives = ".stad-lab-drive, .stad-lab-again, .stad-lab-begin";
-  seat.addEventListener("click", ({ isTrusted, target }) =>
-    isTrusted && target.closest(drives) && take());
+  seat.addEventListener("click", ({ isTrusted, target }) => {
+    const pauses = target.closest(".stad-lab-drive") && !running();
+    if (isTrusted && target.closest(drives) && !pauses) take();
+  });
   picture.addEventListener("click", take);
   const changed = () => (seat.classList.contains("stad-lab-driving") ? take() : update());
   new MutationObserver(changed).observe(seat, { attributes: true, attributeFilter: ["class"] });

@@ -99,7 +99,7 @@ def evaluate(
 def read_unfinished(file: Path | None, asked: dict) -> tuple[dict, float]:
     """What an interrupted evaluation has driven, track -> (return, frames), and its seconds.
 
-    Both are empty if there is no such file, or it is of another agent, machine or other tracks.
+    Both are empty without such a file, or if agent, tracks, machine or a version is another.
     """
     known = {}
     if file and file.exists():

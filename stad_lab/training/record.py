@@ -77,7 +77,7 @@ def open_record(config: Config, folder: Path, before: dict | None, made: dict) -
         return {**new, "made_with": made, "seconds": {}, **earlier}
     record = load_json(path, kind="record")
     if (folder / VAE_FILE).exists():  # then its part of the configuration has not changed
-        fixed = {name: new["config"][name] for name in ("variant", "seed", "data", "vae")}
+        fixed = {name: new["config"][name] for name in ("variant", "vae")} | made_with(config)
         check_same(path, record["config"], fixed)
     return record | new
 

@@ -46,7 +46,7 @@ def test_losses_and_returns_are_those_of_the_run(told):
     )
 
 
-def test_a_training_that_is_refused_or_trains_nothing_erases_no_events(told):
+def test_a_training_that_is_refused_or_ends_with_the_dataset_erases_no_events(told):
     before = {path: path.stat().st_size for path in (told[0] / "tensorboard").rglob("*")}
     assert main([*TRAIN, str(told[0]), "--seed", "1"]) == 2
     assert main([*TRAIN, str(told[0]), "--until", "dataset"]) == 0

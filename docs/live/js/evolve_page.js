@@ -242,7 +242,7 @@ stad.start(async () => {
     const { asked } = stad.evolveSettings;
     const same = stad.evolveSettings.equal(stad.evolveSettings.fromAddress(), wished);
     if (asked && !same) open().catch(stad.fail);
-    else if (asked) get("answer").textContent ||= stad.evolveSettings.ignored(location.hash);
+    else if (asked) get("warning").textContent = stad.evolveSettings.ignored(location.hash);
   });
 
   await open();
