@@ -101,5 +101,5 @@ def about_tracks(commitment: str, facts: dict) -> str:
         text += "<p>Save this as tracks.json; <code>python -m stad_course commit tracks.json"
         text += f"</code> prints the hash.</p><pre><code>{file}</code></pre></details>"
     apart = "had no network, and could not see the tracks or each other"
-    here = "had the rights of the account that ran them, or some had: not all were isolated"
+    here = "were not all isolated: the others had the rights of the account that ran them"
     return f"{text}<p class=soft>The agents {apart if facts['isolated'] else here}.</p>"

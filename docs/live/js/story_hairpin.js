@@ -31,7 +31,7 @@ stad.figure("hairpin", async (part) => {
     const tile = lost[0]?.tile;
     const apart = tile === undefined ? Infinity : Math.abs(tile - mark);
     const near = Math.min(apart, track.count - apart) < 20;
-    const points = `${car.score.toFixed(0)} points.`;
+    const points = `${stad.fixed(car.score)} points.`;
     let text = `It stayed on the road, with ${points}`;
     if (tile !== undefined) {
       const left = `the car first left the road after ${stad.seconds(lost[0].frame)} seconds`;
@@ -61,7 +61,8 @@ stad.figure("hairpin", async (part) => {
       context.fillText("?", x, y + 4);
     }
     if (path.length) stad.fillDot(context, place(path.at(-1)), 6, stad.COLORS.blue);
-    const state = over ? part("answer").textContent : begun ? `${car.score.toFixed(0)} points` : "";
+    const points = begun ? `${stad.fixed(car.score)} points` : "";
+    const state = over ? part("answer").textContent : points;
     const marked = mark === null ? "no place is marked" : `your mark is at tile ${mark}`;
     stad.describe(part("map"), `track 19 with ${track.count} tiles; ${marked}. ${state}`);
   }
