@@ -191,7 +191,7 @@ print("drove")
 """
     (tmp_path / "script.py").write_text(script)
     command = [sys.executable, tmp_path / "script.py"]
-    process = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    process = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert process.stdout == "(64, 64, 3) frame\ndrove\n", process.stderr
 
 

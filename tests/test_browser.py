@@ -205,8 +205,11 @@ def test_a_student_drives_with_keys_dreams_and_shares_the_wheel_with_the_agent(r
         tells("keys held: none")
     page.keyboard.down("w")
     tells("keys held: gas")
-    before = page.evaluate("window.pictures")
-    wait_for(lambda: page.evaluate("window.pictures") > before + 10, "ten pictures")
+    before, begin = page.evaluate("window.pictures"), time.monotonic()
+    time.sleep(2)
+    rate = (page.evaluate("window.pictures") - before) / (time.monotonic() - begin)
+    print(f"{rate:.1f} pictures a second arrive in the browser; load {os.getloadavg()[0]:.1f}")
+    assert rate > 5  # a busy machine is slow; the line above says how fast this one was
     page.keyboard.up("w")
     tells("keys held: none")
 

@@ -387,7 +387,8 @@ def test_a_preset_may_stand_anywhere_and_a_wrong_one_in_the_environment_breaks_t
     flags = ("--tensorboard", "--no-tensorboard", "--data.no-crop-bar", "--data.no_crop_bar")
     for command in (*orders, *(f"--out run {flag} quick" for flag in flags)):
         arguments = parse(["train", *command.split()]).keywords
-        assert arguments["config"].vae == QUICK.vae and arguments["out"] in ("run", "quick")
+        asked = QUICK.replace(data={"crop_bar": "crop" not in command})
+        assert arguments["config"] == asked and arguments["out"] in ("run", "quick")
     monkeypatch.setenv("STAD_LAB_PRESET", "bogus")
     assert parse(["evaluate", "--agent", "frame"]).keywords["agent"] == "frame"
     with pytest.raises(ValueError, match="unknown preset 'bogus'"):

@@ -123,13 +123,15 @@ def note():
     compile_pictures()
     done.append(1)
 cars.compile_pictures = note
-def work(_):
-    cars.Cars(1)
-    return len(done)
+def work(seed):
+    car, compiled = cars.Cars(1), len(done)
+    car.reset([seed])
+    return compiled, int(car.draw().sum())
 with ThreadPoolExecutor(4) as pool:
-    print(*pool.map(work, range(4)))
+    found = set(pool.map(work, [1] * 4))
+print(len(found), *(compiled for compiled, _ in found))
 """
-    assert run(code)[0] == ["1 1 1 1"]
+    assert run(code)[0] == ["1 1"]
 
 
 @pytest.mark.long

@@ -801,12 +801,10 @@ def test_the_seconds_of_a_stage_survive_a_kill(tmp_path, in_this_process, monkey
         killed.append((tmp_path / "record.json").read_bytes())  # what a kill would leave here
         return True
 
-    begin = time.perf_counter()
     run_stage(stage, tmp_path, in_this_process)
-    elapsed = time.perf_counter() - begin
     (tmp_path / "record.json").write_bytes(killed[0])
     left = load_json(tmp_path / "record.json")["seconds"]["mdn_rnn"]
-    assert 0.04 < left < elapsed
+    assert 0.2 < left < 0.6
     run_stage(stage, tmp_path, in_this_process)
     assert load_json(tmp_path / "record.json")["seconds"]["mdn_rnn"] > left + 0.5
 
