@@ -198,9 +198,12 @@ def strongest(claims: dict) -> str:
     for variant, one in study["agents"].items():
         scores = ", ".join(f"{score:.1f}" for score in one["scores"])
         cells = (f"`{variant}`", scores, f"{one['mean']:.1f}", f"{one['minimum']:.0f}")
-        lines.append((*cells, str(one["failures"]), "yes" if one["reached"] else "no"))
+        cells += (str(one["failures"]), "yes" if one["reached"] else "no")
+        lines.append((*cells, f"{study['shipped'][variant]:.1f}"))
     head = ("variant", "three seeds", "chosen agent", "minimum", "below 800", "goal reached")
-    return table(head, lines)
+    told = table((*head, "shipped before"), lines)
+    outcome = "replaced, all together" if study["replaced"] else "kept"
+    return f"{told}\n\nThe four agents that were shipped before are {outcome}."
 
 
 def outcomes(claims: dict) -> str:

@@ -10,7 +10,8 @@ In the folder of the study::
     seed400/frame/score.json
 
 Whatever is there is not done again. A finished run is added to the tables. Of each variant the
-agent with the best validation is kept in `networks/study4`, to be shipped.
+agent with the best validation is kept in `networks/study4`, to be shipped. After the last run the
+agents that are shipped now drive on the same tracks: they are replaced if they score less.
 """
 
 import time
@@ -21,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas
 
-from stad_lab.agent import load_agent
+from stad_lab.agent import PRETRAINED, load_agent
 from stad_lab.config import VARIANTS, Config
 from stad_lab.evaluation.statistics import FAILED
 from stad_lab.io.files import checksum_of_arrays, load_json, locked, save_json
@@ -53,6 +54,7 @@ SEEDS = range(400, 403)
 TRACKS = range(6000, 6400)  # of the score, with the fast renderer
 VALIDATION = 64  # tracks of a validation in the fine-tuning, by which agents are chosen
 STAGES = ("first", "second", "tuned")
+SHIPPED = "study4_shipped"  # the table of the agents that were shipped before
 
 
 class Run(NamedTuple):
@@ -108,6 +110,8 @@ def run_study4(
     print(f"{NAME}: {describe_progress(to)}")
     if failed:
         raise ValueError(f"{', '.join(failed)}: not finished, for the reasons above")
+    if all(recorded(run, to) for run in find_runs()):
+        score_shipped(root, to)
 
 
 def do_run(run: Run, root: Path, to: Path, repeat: bool) -> None:
@@ -143,13 +147,48 @@ def run_one(run: Run, root: Path) -> dict:
         train(configs["second"], second, earlier=first)
         fine_tune(configs["tuned"], second, tuned)
         copy_in_half(tuned, folder / "agent")
-        agent = load_agent(folder / "agent")
-        begin, limits = time.perf_counter(), {"max_frames": STUDIES["study1"].max_frames}
-        score = drive_tracks(agent, TRACKS, processes=1, label=run.name, limits=limits)
+        begin = time.perf_counter()
+        score = score_agent(folder / "agent", run.name)
     seconds = time.perf_counter() - begin
     told = {"kind": "score", "variant": run.variant, "made_with": made_with}
     save_json(folder / SCORE, {**told, **score, "seconds": seconds})
     return score
+
+
+def score_agent(source: str | Path, label: str) -> dict:
+    """Drive an agent on the tracks of the score."""
+    limits = {"max_frames": STUDIES["study1"].max_frames}
+    return drive_tracks(load_agent(source), TRACKS, processes=1, label=label, limits=limits)
+
+
+def score_shipped(root: Path, to: Path) -> None:
+    """Score the shipped agents that the table of them in `to` lacks, and add each to it.
+
+    Once there, an agent is not scored again: those of study 4 may be shipped meanwhile.
+    """
+    for variant in VARIANTS:
+        with claimed(root / "shipped" / variant) as ours:
+            if not ours or tables.line_of(SHIPPED, [variant], to):
+                continue
+            with fixed_threads():
+                score = score_agent(variant, f"shipped {variant}")
+            line = {"variant": variant} | controller_of(PRETRAINED / variant)
+            made_with = provenance(f"python -m stad_study replicate {NAME} --out ...")
+            line |= {name: made_with[name] for name in ("commit", "processor", "numba")}
+            with locked(to, WAIT):
+                lines = pandas.DataFrame([line | returns_by_track(score)])
+                tables.replace_lines(SHIPPED, lines, to)
+
+
+def returns_by_track(score: dict) -> dict[str, float]:
+    """The returns of a score for a table, a column for each track; rounded to cents."""
+    return {str(one["track"]): round(one["return"], 2) for one in score["episodes"]}
+
+
+def controller_of(folder: Path) -> dict[str, str]:
+    """The checksum of an agent's C, for a table."""
+    parameters, _ = load_controller(folder / CONTROLLER_FILE)
+    return {"controller": checksum_of_arrays(parameters=parameters)}
 
 
 def describe_run(folder: Path, score: dict) -> dict:
@@ -172,18 +211,13 @@ def describe_run(folder: Path, score: dict) -> dict:
         line[f"processors.{stage}"] = "; ".join(used)
         line[f"seconds.{stage}"] = round(sum(record["seconds"].values()), 1)
     line["seconds.score"] = round(score["seconds"], 1)
-    line |= total_budget(records["tuned"])
-    parameters, _ = load_controller(folder / "agent" / CONTROLLER_FILE)
-    return line | {"controller": checksum_of_arrays(parameters=parameters)}
+    return line | total_budget(records["tuned"]) | controller_of(folder / "agent")
 
 
 def add_run(run: Run, root: Path, to: Path) -> None:
-    """Add a finished run to the tables, and keep its agent if it is the best of its variant.
-
-    Returns are rounded to cents.
-    """
+    """Add a finished run to the tables, and keep its agent if it is the best of its variant."""
     score, key = load_json(root / run.name / SCORE, kind="score"), run._asdict()
-    returns = {str(one["track"]): round(one["return"], 2) for one in score["episodes"]}
+    returns = returns_by_track(score)
     line = key | describe_run(root / run.name, score)
     with locked(to, WAIT):
         if recorded(run, to):

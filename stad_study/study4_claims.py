@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from stad_lab.config import VARIANTS
 from stad_lab.evaluation.statistics import FAILED
 from stad_study import tables
-from stad_study.study4 import TRACKS, find_runs
+from stad_study.study4 import SHIPPED, TRACKS, find_runs
 
 GOAL = 930.0  # points in the mean, and no return below FAILED
 
@@ -17,11 +18,13 @@ GOAL = 930.0  # points in the mean, and no return below FAILED
 def describe_study4(folder: Path = tables.DATA) -> dict:
     """Progress; and after the last run "agents": variant -> its agent with the best validation.
 
-    ValueError if a run has no return of each track.
+    Then also "shipped": the means of the four agents that were shipped before, and "replaced":
+    whether these score less. ValueError if a run has no return of each track.
     """
     runs = tables.read_or_empty("study4_runs", folder).set_index(tables.AGENT)
     found: dict = {"runs": len(runs), "planned": len(find_runs())}
-    if found["runs"] < found["planned"]:
+    shipped = tables.read_or_empty(SHIPPED, folder).set_index("variant")
+    if found["runs"] < found["planned"] or len(shipped) < len(VARIANTS):
         return found
     returns = tables.returns_of_runs("study4", TRACKS, folder)
     found["agents"] = {}
@@ -31,6 +34,9 @@ def describe_study4(folder: Path = tables.DATA) -> dict:
             "seed": int(chosen[0]),
             "scores": own.sort_index()["mean"].tolist(),
         }
+    found["shipped"] = shipped[[str(track) for track in TRACKS]].mean(axis=1).to_dict()
+    chosen = [one["mean"] for one in found["agents"].values()]
+    found["replaced"] = bool(np.mean(chosen) > np.mean(list(found["shipped"].values())))
     return found
 
 

@@ -4,6 +4,7 @@ import dataclasses
 import shutil
 
 import numpy as np
+import pandas
 import pytest
 
 from stad_lab.agent import load_agent
@@ -14,7 +15,7 @@ from stad_lab.training.record import RECORD, processor
 from stad_study import study4, tables
 from stad_study.cli import main
 from stad_study.experiments import EXPERIMENTS
-from stad_study.study import STUDIES
+from stad_study.study import STUDIES, drive_tracks
 from stad_study.study4 import STAGES, Run, add_run, find_runs, run_study4
 
 BRIEF = {"generations": 2, "validate_every": 1, "max_frames": 20}
@@ -126,6 +127,25 @@ def test_of_a_variant_the_agent_with_the_best_validation_is_kept(made, tmp_path)
         add_run(RUN, made / "study4", tmp_path / "data")
         assert kept.exists() == is_kept
         assert len(tables.read("study4_runs", tmp_path / "data")) == 2
+
+
+def test_after_the_last_run_the_shipped_agents_drive_on_the_same_tracks_once(made, tmp_path):
+    line = tables.read("study4_runs", made / "data")
+    lines = [line.assign(**run._asdict()) for run in find_runs()]
+    tables.save("study4_runs", pandas.concat(lines[:-1]), tmp_path)
+    run_study4(tmp_path, seeds=[400], to=tmp_path)
+    assert not (tmp_path / "study4_shipped.csv").exists()  # a run is missing
+    tables.save("study4_runs", pandas.concat(lines), tmp_path)
+    run_study4(tmp_path, to=tmp_path)
+    shipped = tables.read("study4_shipped", tmp_path).set_index("variant")
+    assert set(shipped.index) == set(VARIANTS)
+    for variant in VARIANTS:
+        driven = drive_tracks(load_agent(variant), range(6000, 6003), 1, limits={"max_frames": 40})
+        returns = [round(one["return"], 2) for one in driven["episodes"]]
+        assert shipped.loc[variant, ["6000", "6001", "6002"]].tolist() == returns
+    tables.save("study4_shipped", shipped.assign(controller="older").reset_index(), tmp_path)
+    run_study4(tmp_path, to=tmp_path)
+    assert set(tables.read("study4_shipped", tmp_path)["controller"]) == {"older"}
 
 
 def test_bad_names_and_options_are_refused_in_one_line(tmp_path, capsys):

@@ -1,5 +1,8 @@
 """Study 4: one agent of each variant, reported after the last run."""
 
+import sys
+from pathlib import Path
+
 import pandas
 import pytest
 
@@ -7,6 +10,9 @@ from stad_lab.config import VARIANTS
 from stad_study import tables
 from stad_study.study4 import TRACKS, find_runs
 from stad_study.study4_claims import describe_study4
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
+import blocks
 
 
 def write_tables(folder, runs, returns_of):
@@ -22,6 +28,15 @@ def write_tables(folder, runs, returns_of):
         tables.save(f"study4_{name}", pandas.DataFrame(lines), folder)
 
 
+def write_shipped(folder, means):
+    """The table of agents that were shipped before, and score `means`."""
+    made = {"processor": "a CPU", "controller": "c"}
+    lines = [
+        {"variant": one, **made, **dict.fromkeys(map(str, TRACKS), means[one])} for one in means
+    ]
+    tables.save("study4_shipped", pandas.DataFrame(lines), folder)
+
+
 def test_of_each_variant_the_agent_with_the_best_validation_is_reported_after_the_last_run(
     tmp_path,
 ):
@@ -34,6 +49,8 @@ def test_of_each_variant_the_agent_with_the_best_validation_is_reported_after_th
     write_tables(tmp_path, find_runs()[:-1], returns_of)
     assert describe_study4(tmp_path) == {"runs": 11, "planned": 12}
     write_tables(tmp_path, find_runs(), returns_of)
+    assert describe_study4(tmp_path) == {"runs": 12, "planned": 12}  # the shipped ones are to drive
+    write_shipped(tmp_path, dict.fromkeys(VARIANTS, 930.0))
     found = describe_study4(tmp_path)["agents"]
     assert set(found) == set(VARIANTS) and {one["seed"] for one in found.values()} == {402}
     assert {name for name, one in found.items() if one["reached"]} == {"input", "input_output"}
@@ -42,8 +59,24 @@ def test_of_each_variant_the_agent_with_the_best_validation_is_reported_after_th
     assert found["frame"]["mean"] == found["frame"]["scores"][-1]
 
 
+@pytest.mark.parametrize(("mean_of_frame", "replaced"), [(919.0, True), (921.0, False)])
+def test_the_shipped_agents_are_replaced_all_together_if_their_mean_is_lower(
+    tmp_path, mean_of_frame, replaced
+):
+    write_tables(tmp_path, find_runs(), lambda run: [920.0] * len(TRACKS))
+    write_shipped(tmp_path, dict.fromkeys(VARIANTS, 920.0) | {"frame": mean_of_frame})
+    found = describe_study4(tmp_path)
+    assert found["shipped"]["frame"] == mean_of_frame and found["replaced"] is replaced
+    claims = {"study4": found}
+    told = "replaced, all together" if replaced else "kept"
+    assert blocks.strongest(claims).endswith(
+        f"The four agents that were shipped before are {told}."
+    )
+
+
 def test_a_run_without_all_its_returns_is_refused(tmp_path):
     write_tables(tmp_path, find_runs(), lambda run: [900.0] * len(TRACKS))
+    write_shipped(tmp_path, dict.fromkeys(VARIANTS, 900.0))
     table = tables.read("study4_returns", tmp_path)
     tables.save("study4_returns", table.iloc[:-1], tmp_path)
     with pytest.raises(ValueError, match="study4_returns: expected a return of each run"):
