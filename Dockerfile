@@ -3,10 +3,11 @@
 #     docker build -t stad_lab .
 #     docker run --rm -p 127.0.0.1:8888:8888 stad_lab
 #
-# Then open the address that it prints.
+# Then open the printed address that begins with http://127.0.0.1.
 FROM python:3.12-slim
 
-RUN useradd --create-home --uid 1000 driver
+# Other users may enter the home: a grader runs submissions under an id of its own.
+RUN useradd --create-home --uid 1000 driver && chmod 755 /home/driver
 USER driver
 WORKDIR /home/driver/stad_lab
 

@@ -102,11 +102,11 @@ def gains(claims: dict) -> str:
         told.append(f"{name_verdict(one)} ({round(one['difference'])} points)")
     both, alone = told
     if out_of_reach(study, "z, h"):
-        both += "; the paper's gain exceeds our recipe's reach"
+        both += "; the paper's gain would exceed our best runs"
     return (
         "Does it help to see and reconstruct what has moved? A paper says so. We trained agents"
-        " with and without it twelve times each. If the driver sees the memory, as probably in the"
-        f" paper: {both}. If not: {alone}."
+        " with and without it twelve times each. If the driver sees the memory, as in World"
+        f" Models: {both}. If not: {alone}."
     )
 
 

@@ -44,8 +44,8 @@ def facts(claims: dict) -> dict:
     gains = {f"gain of {name}": gain for name, gain in PAPER_GAINS.items()}
     gain, most = min(gains.values()), max(gains.values())
     own = {"paper": dict(PAPER), "gain": gain, "most gain": most, **gains}
-    runs = claims["experiments"]["paper_frame"]["runs"]
-    own |= {"lowest paper_frame": min(runs), "highest paper_frame": max(runs)}
+    runs = claims["study1"]["arms"]["z, h: frame"]["by_seed"]
+    own |= {"lowest frame": min(runs), "highest frame": max(runs)}
     own["networks"] = blocks.NUMBERS["trained networks"](claims)
     return claims | own | {"recipe": Config.preset("laptop").as_dict()}
 

@@ -12,5 +12,9 @@ if __name__ == "__main__":
 
         if isinstance(sys.stdout, io.TextIOWrapper):
             sys.stdout.reconfigure(errors="backslashreplace")  # for letters that a console lacks
-        sys.exit(tell_environment())
-    run_program("stad_course", progress=())
+        try:
+            sys.exit(tell_environment())
+        except KeyboardInterrupt:
+            print("\nstopped", file=sys.stderr)
+            sys.exit(130)
+    run_program("stad_course", progress=("compete",))

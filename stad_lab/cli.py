@@ -63,7 +63,8 @@ def result_file(file: Path | None, source: str, kind: str, details: str = "") ->
 
     run = run_folder(source)
     name = f"{kind}-{run.resolve().name}{details}.json"
-    file = file or (Path(name) if run.parent == PRETRAINED else run / name)
+    shipped = run.resolve().parent == PRETRAINED.resolve()
+    file = file or (Path(name) if shipped else run / name)
     check_output(file, kind)
     return file
 
@@ -237,12 +238,12 @@ def report(run: str, out: Path | None = None) -> None:
     """
     from stad_lab.agent import PRETRAINED, run_folder
     from stad_lab.io.files import check_writable, write_bytes
-    from stad_lab.training.record import check_record
+    from stad_lab.training.record import read_record
     from stad_lab.viz.report import report
 
     folder = run_folder(run)
-    check_record(folder)
-    shipped = folder.parent == PRETRAINED
+    read_record(folder)
+    shipped = folder.resolve().parent == PRETRAINED.resolve()
     file = out or (Path(f"report-{folder.name}.html") if shipped else folder / "report.html")
     if file.suffix.lower() != ".html":
         raise ValueError(f"--out {file}: expected a .html")

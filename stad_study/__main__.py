@@ -3,4 +3,4 @@
 from stad_lab.streams import run_program
 
 if __name__ == "__main__":
-    run_program("stad_study", progress=("replicate", "latents", "probe"))
+    run_program("stad_study", progress=("replicate", "evaluate", "latents", "probe"))

@@ -7,7 +7,7 @@ from typing import Literal
 import tyro
 
 from stad_lab import command_line
-from stad_lab.command_line import cluster_of, output
+from stad_lab.command_line import cluster_of, given, output
 from stad_lab.config import STUDY_TRACKS, Config
 
 
@@ -62,6 +62,8 @@ def replicate(
     if only:
         raise ValueError(f"--only {only[0]}: {experiment!r} is no study, and has seeds alone")
     if keep:
+        if scheduler:
+            raise ValueError("--keep drives nothing: leave --scheduler out")
         kept = run.keep(experiment, folder, seeds)
         print("\n".join(f"kept {name}" for name in kept) or "no seed is finished")
         return
@@ -157,7 +159,7 @@ def latents(
     out: str,
     preset: Literal["quick", "fast", "laptop", "paper"] = "laptop",
     parts: tuple[Literal["probe", "vae", "mdn_rnn"], ...] = (),
-    dataset: Path | None = None,
+    dataset: str | None = None,
 ) -> None:
     """Measure the shipped V and M, and what they are compared with, on unseen episodes.
 
@@ -173,9 +175,8 @@ def latents(
     from stad_study.latents import PARTS, measure
 
     folder = output(out)
-    measure(
-        Config.preset(preset), dataset or folder / "dataset", folder, list(parts) or list(PARTS)
-    )
+    data = folder / "dataset" if dataset is None else given(dataset, "--dataset")
+    measure(Config.preset(preset), data, folder, list(parts) or list(PARTS))
     print(f"every measurement: {folder / 'latents.json'}")
 
 

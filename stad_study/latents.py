@@ -80,10 +80,12 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[st
     """
     if unknown := [part for part in parts if part not in PARTS]:
         raise ValueError(f"unknown part {unknown[0]!r}: choose from {', '.join(PARTS)}")
+    if (file := work / "latents.json").exists():
+        load_json(file)  # before any work: it may be damaged
     collect(config, dataset_folder)
     count = max(FEWEST_TRAJECTORIES, config.data.episodes // 5)
     driven = random_trajectories(count, config.seed + 1, config.processes)
-    given, file, result = Given(config, dataset_folder, work, driven), work / "latents.json", {}
+    given, result = Given(config, dataset_folder, work, driven), {}
     for name in parts:
         found = PARTS[name](given)
         found |= {"trajectories": len(driven), "config": config.as_dict()}

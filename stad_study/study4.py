@@ -11,7 +11,8 @@ In the folder of the study::
 
 Whatever is there is not done again. A finished run is added to the tables. Of each variant the
 agent with the best validation is kept in `networks/study4`, to be shipped. After the last run the
-agents that are shipped now drive on the same tracks: they are replaced if they score less.
+agents that are shipped now drive on the same tracks: they are replaced if they score less. That is
+done without `--only`, which does what it names.
 """
 
 import time
@@ -110,7 +111,7 @@ def run_study4(
     print(f"{NAME}: {describe_progress(to)}")
     if failed:
         raise ValueError(f"{', '.join(failed)}: not finished, for the reasons above")
-    if all(recorded(run, to) for run in find_runs()):
+    if not only and all(recorded(run, to) for run in find_runs()):
         score_shipped(root, to)
 
 
@@ -170,10 +171,10 @@ def score_shipped(root: Path, to: Path) -> None:
         with claimed(root / "shipped" / variant) as ours:
             if not ours or tables.line_of(SHIPPED, [variant], to):
                 continue
+            made_with = provenance(f"python -m stad_study replicate {NAME} --out ...")
             with fixed_threads():
                 score = score_agent(variant, f"shipped {variant}")
             line = {"variant": variant} | controller_of(PRETRAINED / variant)
-            made_with = provenance(f"python -m stad_study replicate {NAME} --out ...")
             line |= {name: made_with[name] for name in ("commit", "processor", "numba")}
             with locked(to, WAIT):
                 lines = pandas.DataFrame([line | returns_by_track(score)])

@@ -1,6 +1,6 @@
 """The outcome of study 4 that docs/protocol.md fixes: one agent of each variant, no inference.
 
-It is reported once all runs are in the tables.
+It is reported once all runs, and the agents shipped before, are in the tables.
 """
 
 from pathlib import Path

@@ -57,6 +57,18 @@ def measured(quick_run, tmp_path_factory):
     return folder
 
 
+@pytest.mark.parametrize("problem", ["--dataset is empty", "latents.json is damaged"])
+def test_what_is_wrong_with_a_folder_is_said_before_any_work(
+    problem, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "latents.json").write_text("{")
+    empty = ["--dataset", ""] if problem.startswith("--dataset") else []
+    assert main(["latents", "--preset", "quick", "--out", ".", *empty]) == 2
+    assert problem in capsys.readouterr().err
+    assert [file.name for file in tmp_path.iterdir()] == ["latents.json"]
+
+
 @pytest.fixture
 def reduced(measured, quick_run):
     """The arguments of `reduced_predictions`, on random z and actions."""

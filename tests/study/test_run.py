@@ -257,6 +257,7 @@ def test_the_command_says_the_time_runs_a_seed_and_keeps_it(made, tmp_path, monk
     [
         (["papers"], "unknown experiment 'papers': choose one of paper_frame, "),
         (["one_iteration", "--seeds", "1", "7"], "experiment 'one_iteration' has no seed 7"),
+        (["one_iteration", "--keep", "--scheduler", "tcp://a:1"], "--keep drives nothing"),
     ],
 )
 def test_an_unknown_experiment_or_seed_ends_in_one_line(options, message, tmp_path, capsys):

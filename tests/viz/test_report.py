@@ -1,5 +1,6 @@
 """The report of a run: one file with scores, film and curves, for runs finished or not."""
 
+import os
 import re
 import shutil
 from pathlib import Path
@@ -85,10 +86,14 @@ def test_the_command_writes_the_report_into_the_run(run):
     assert (run / "report.html").read_text(encoding="utf-8").startswith("<!doctype html>")
 
 
-def test_the_report_of_a_shipped_agent_is_not_written_into_the_package(tmp_path, monkeypatch):
+@pytest.mark.parametrize("by_path", [False, True])
+def test_the_report_of_a_shipped_agent_is_not_written_into_the_package(
+    by_path, tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     before = sorted(PRETRAINED.rglob("*"))
-    assert main(["report", "--run", "frame"]) == 0
+    agent = os.path.relpath(PRETRAINED / "frame") if by_path else "frame"
+    assert main(["report", "--run", agent]) == 0
     assert (tmp_path / "report-frame.html").exists()
     assert sorted(PRETRAINED.rglob("*")) == before
 
@@ -100,6 +105,11 @@ def test_a_damaged_file_ends_in_one_line_and_writes_nothing(run, capsys, name):
     (line,) = capsys.readouterr().err.splitlines()
     assert name in line
     assert not (run / "report.html").exists()
+
+
+def test_a_misspelt_run_gets_no_folder(tmp_path, capsys):
+    assert main(["report", "--run", str(tmp_path / "typo")]) == 2
+    assert "there is no folder" in capsys.readouterr().err and not list(tmp_path.iterdir())
 
 
 def test_a_report_is_written_to_html_files_only(quick_run, tmp_path, capsys):
