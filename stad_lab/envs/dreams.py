@@ -118,6 +118,12 @@ class DreamVector(gym.vector.VectorEnv):
         self._check_begun()
         return tuple(to_uint8(self.vae.decode(torch.from_numpy(self._observations()))[0]))
 
+    @property  # type: ignore[misc]  # as SyncVectorEnv
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # type: ignore[override]
+        """The random numbers of each dream."""
+        self._check_open()
+        return tuple(dream.np_random for dream in self.dreams)
+
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # type: ignore[override]
         """The last seed of each dream."""

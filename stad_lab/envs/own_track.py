@@ -37,7 +37,7 @@ def make_own_track(checkpoints: Checkpoints) -> Track:
         checkpoints = read_checkpoints(Path(checkpoints))
     try:
         points = np.array(checkpoints, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         points = np.empty(0)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
         raise ValueError(

@@ -19,9 +19,9 @@ from pathlib import Path
 
 import torch
 
-from stad_lab.config import Config
+from stad_lab.config import Config, check_same
 from stad_lab.inference import Inference
-from stad_lab.io.files import load_json, locked, save_json
+from stad_lab.io.files import load_json, load_tensors, locked, save_json
 from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_world_model
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
@@ -35,7 +35,8 @@ from stad_lab.training.dataset import (
     read_manifest,
 )
 from stad_lab.training.evolution import LOG, evolve, read_log
-from stad_lab.training.mdn_rnn import check_mdn_rnn, train_mdn_rnn
+from stad_lab.training.mdn_rnn import CHECKPOINT as MDN_RNN_TRAINING
+from stad_lab.training.mdn_rnn import check_mdn_rnn, mdn_rnn_depends_on, train_mdn_rnn
 from stad_lab.training.record import (
     RECORD,
     budget,
@@ -48,7 +49,8 @@ from stad_lab.training.record import (
     timed,
 )
 from stad_lab.training.subspace import COMPONENTS_FILE, START_FILE, find_components
-from stad_lab.training.vae import check_vae, train_vae
+from stad_lab.training.vae import CHECKPOINT as VAE_TRAINING
+from stad_lab.training.vae import check_vae, train_vae, vae_depends_on
 
 STAGES = ("dataset", "vae", "mdn_rnn", "controller")
 WEIGHTS = (VAE_FILE, MDN_RNN_FILE, START_FILE, COMPONENTS_FILE, CONTROLLER_FILE)
@@ -140,15 +142,23 @@ def check_apart(earlier: Path, folder: Path) -> None:
 
 
 def check_stages(config: Config, folder: Path, data: Path) -> None:
-    """Raise ValueError, before any work, if a finished stage in the folder is of another run.
+    """Raise ValueError, before any work, if a stage begun in the folder is of another run.
 
     Or if `Inference`, with which agents drive, refuses V or M of this configuration.
     """
     check_record(folder)
     with torch.random.fork_rng([]):
-        Inference(VAE.of(config), MDNRNN.of(config))
+        Inference(VAE.of(config).float(), MDNRNN.of(config).float())
     if not config.data.agent_episodes:
         read_manifest(data, made_with(config))
+    for weights, training, depends_on in (
+        (VAE_FILE, VAE_TRAINING, vae_depends_on(config)),
+        (MDN_RNN_FILE, MDN_RNN_TRAINING, mdn_rnn_depends_on(config)),
+    ):
+        if not (folder / weights).exists() and (folder / training).exists():
+            remedy = "run the same command again to train from the start"
+            was = load_tensors(folder / training, remedy)[1].get("made_with", {})
+            check_same(folder / training, was, depends_on)
     if (folder / VAE_FILE).exists():
         seen = check_vae(config, folder)["dataset"]
         check_seen(folder / VAE_FILE, seen, data)

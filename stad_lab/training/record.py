@@ -51,16 +51,16 @@ def read_record(folder: Path) -> dict:
 
 
 def read_finished(earlier: Path) -> dict:
-    """The record of a run whose CMA-ES has finished.
+    """The record of a run that has finished.
 
     ValueError if it has not, or a file is damaged; FileNotFoundError if there is no run, or no log.
     """
     record = read_record(earlier)
     log = load_json(earlier / LOG, GIVE_A_RUN, kind="evolution")
     done, asked = len(log["generations"]), log["evolution"]["generations"]
-    if done != asked:
+    if done != asked or "budget" not in record:
         found = f"with {done} of {asked} generations: run its own command to the end first"
-        raise ValueError(f"CMA-ES in {earlier} is not finished, {found}")
+        raise ValueError(f"the run in {earlier} is not finished, {found}")
     return record
 
 

@@ -18,7 +18,13 @@ from stad_lab.config import Config, random_stream, track_seeds
 from stad_lab.envs.cars import Cars
 from stad_lab.features import features_of
 from stad_lab.io.files import checksum_of_arrays
-from stad_lab.io.weights import CONTROLLER_FILE, WorldModel, load_controller, load_world_model
+from stad_lab.io.weights import (
+    CONTROLLER_FILE,
+    WorldModel,
+    load_controller,
+    load_kind,
+    load_world_model,
+)
 from stad_lab.io.workers import single_thread, worker_threads
 from stad_lab.models.controller import seen_columns, unpack
 from stad_lab.training.dataset import (
@@ -130,12 +136,15 @@ def drive_noisily(agent: Agent, config: Config, index: int) -> Episode:
 def carry_over(config: Config, earlier: Path, dataset: Callable[[], Dataset], folder: Path) -> bool:
     """Fit the C whose outputs on V and M in `folder` are the earlier C's; writes START_FILE.
 
-    False if it was there already. ValueError or FileNotFoundError if a file is damaged or missing.
+    False if it was there already, for the same features. ValueError or FileNotFoundError if a file
+    is damaged or missing.
     """
     path, new = Path(folder) / START_FILE, load_world_model(Path(folder))
+    sees = {"features": config.evolution.features}
     if path.exists():
-        load_start(path, new)
-        return False
+        load_start(path, new)  # raises if it is of another world model
+        if (sees | load_kind(path, "start")[1])["features"] == sees["features"]:
+            return False
     old, (parameters, _) = load_world_model(earlier), load_controller(earlier / CONTROLLER_FILE)
     wanted, seen, data = [], [], dataset()
     for entry, number in enumerate(order_of_episodes(config)):
@@ -146,7 +155,7 @@ def carry_over(config: Config, earlier: Path, dataset: Callable[[], Dataset], fo
     columns = seen_columns(config.evolution.features, *new.sizes)
     targets = np.clip(np.concatenate(wanted), -LIMIT, LIMIT)
     start = fit_controller(np.concatenate(seen), targets, columns)
-    save_start(path, start, config.variant, new)
+    save_start(path, start, config.variant, new, **sees)
     return True
 
 

@@ -57,10 +57,12 @@ def search_space(config: Config, world_model: WorldModel, folder: Path) -> Searc
     return SearchSpace(start[searched], np.zeros(len(start)), np.eye(len(start))[searched])
 
 
-def save_start(path: Path, parameters: np.ndarray, variant: str, world_model: WorldModel) -> None:
+def save_start(
+    path: Path, parameters: np.ndarray, variant: str, world_model: WorldModel, **made_with: str
+) -> None:
     """Write the C, float64 (parameters,), that a second iteration or fine-tuning starts from."""
-    tensors = {"parameters": torch.from_numpy(parameters)}
-    save_tensors(path, tensors, kind="start", variant=variant, **world_model.checksums)
+    tensors, metadata = {"parameters": torch.from_numpy(parameters)}, {"variant": variant}
+    save_tensors(path, tensors, kind="start", **metadata, **made_with, **world_model.checksums)
 
 
 def load_start(path: Path, world_model: WorldModel) -> np.ndarray:

@@ -271,6 +271,9 @@ def test_the_action_of_an_ended_dream_is_ignored_and_each_dream_has_a_seed_of_it
     envs = make_dreams(max_frames=1)
     envs.reset(seed=7)
     assert envs.np_random_seed == (7, 8, 9)
+    random = [one.bit_generator.state for one in envs.np_random]
+    envs.reset(seed=7)
+    assert random == [one.bit_generator.state for one in envs.np_random]
     envs.step(np.zeros((3, 3)))  # all have ended
     assert not envs.step(np.full((3, 3), np.nan))[3].any()
 

@@ -94,6 +94,16 @@ def test_an_evolution_in_two_parts_equals_an_uninterrupted_one(uninterrupted, fi
     assert_equal_evolutions(folder, uninterrupted)
 
 
+def test_an_evolution_may_continue_in_other_groups_of_cars_with_the_same_bits(
+    uninterrupted, first_part, tmp_path
+):
+    folder = shutil.copytree(first_part, tmp_path / "run")
+    assert evolve(config(processes=1, cars=1), folder)
+    found, expected = (load_json(run / LOG) for run in (folder, uninterrupted))
+    assert found["evolution"]["cars"] == 1 != expected["evolution"]["cars"]
+    assert found["generations"] == expected["generations"]
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no signals to send to a process")
 def test_an_interrupted_command_continues_and_equals_an_uninterrupted_one(
     uninterrupted, quick_run, tmp_path, capsys

@@ -130,6 +130,12 @@ def unfinished(folder):
     save_json(folder / LOG, log | {"generations": log["generations"][:2]})
 
 
+def without_budget(folder):
+    record = load_json(folder / "record.json")
+    del record["budget"]
+    save_json(folder / "record.json", record)
+
+
 @pytest.mark.parametrize(
     ("change", "config", "error"),
     [
@@ -149,6 +155,7 @@ def unfinished(folder):
             CONFIG,
             "is not finished, with 2 of 4 generations: run its own command to the",
         ),
+        (without_budget, CONFIG, "is not finished, with 4 of 4 generations: run its own command"),
     ],
 )
 def test_an_earlier_run_that_does_not_fit_is_refused_before_any_work(
@@ -300,6 +307,9 @@ def test_a_c_that_sees_z_alone_starts_without_weights_for_h(second, quick_run, d
     assert carry_over(config, quick_run, lambda: dataset, tmp_path)
     weights = load_file(tmp_path / START_FILE)["parameters"][:-3].reshape(3, -1)
     assert not weights[:, 32:].any() and weights[:, :32].all()
+    assert not carry_over(config, quick_run, lambda: dataset, tmp_path)
+    assert carry_over(CONFIG, quick_run, lambda: dataset, tmp_path)  # other features: fitted anew
+    assert load_file(tmp_path / START_FILE)["parameters"][:-3].reshape(3, -1)[:, 32:].any()
 
 
 def test_a_damaged_start_is_refused_and_a_missing_one_is_made_again(second, quick_run, tmp_path):

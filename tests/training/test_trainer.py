@@ -15,7 +15,7 @@ from stad_lab.models.vae import LOGVAR_RANGE, VAE, vae_losses
 from stad_lab.training import trainer
 from stad_lab.training import vae as vae_training
 from stad_lab.training.dataset import Dataset
-from stad_lab.training.mdn_rnn import train_mdn_rnn
+from stad_lab.training.pipeline import train
 from stad_lab.training.trainer import Training, fit, update
 from stad_lab.training.vae import CHECKPOINT, train_vae
 
@@ -108,10 +108,10 @@ def unusual_torch():
 
 def test_a_training_leaves_torch_as_it_was_and_gives_the_same_v_and_m(dataset, quick_run, tmp_path):
     torch.manual_seed(123)
+    shutil.copytree(quick_run / "dataset", tmp_path / "dataset")
     with unusual_torch():
         before = torch.get_rng_state(), torch.get_default_dtype(), torch.is_grad_enabled()
-        train_vae(QUICK, dataset, tmp_path)
-        train_mdn_rnn(QUICK, dataset, tmp_path)
+        train(QUICK, tmp_path, until="mdn_rnn")
         after = torch.get_rng_state(), torch.get_default_dtype(), torch.is_grad_enabled()
     assert torch.equal(before[0], after[0]) and before[1:] == after[1:]
     for name in ("vae.safetensors", "mdn_rnn.safetensors"):
@@ -143,6 +143,19 @@ def test_a_half_trained_v_continues_with_another_sigma_and_with_no_other_setting
     assert seen[0] == 8  # it continued from its last checkpoint
     found, expected = (load_file(one / "vae.safetensors") for one in (tmp_path, quick_run))
     assert all(found[name].equal(expected[name]) for name in expected)
+
+
+def test_a_command_with_another_setting_of_a_half_trained_m_leaves_the_record_as_it_is(
+    quick_run, tmp_path, interrupt_after
+):
+    kept = shutil.ignore_patterns("mdn_rnn*", "controller*", "components*", "evolution*")
+    run = shutil.copytree(quick_run, tmp_path / "run", ignore=kept)
+    with interrupt_after(10):
+        train(QUICK, run)
+    before = (run / "record.json").read_bytes()
+    with pytest.raises(ValueError, match=r"mdn_rnn\.steps=\d+, now mdn_rnn\.steps=9 is asked for"):
+        train(QUICK.replace(mdn_rnn={"steps": 9}), run)
+    assert (run / "record.json").read_bytes() == before
 
 
 def test_a_checkpoint_made_before_a_setting_existed_continues(dataset, tmp_path, interrupt_after):
