@@ -205,6 +205,9 @@ def test_the_reader_closes_the_eyes_drives_and_opens_them_with_the_keyboard_alon
     page.keyboard.down("ArrowUp")
     assert page.locator("button[data-pedal=gas].held").count() == 1
     page.keyboard.up("ArrowUp")
+    running = page.evaluate("stad.page.clock.running")
+    page.keyboard.press("p")
+    assert page.evaluate("stad.page.clock.running") is not running
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Escape")  # gives the keys back, and the dream waits
     page.evaluate("scrollTo(0, 0)")

@@ -126,6 +126,30 @@ def test_another_rival_in_a_pause_ends_the_race_and_its_dream(opened):
     assert page.is_hidden("#dream") and page.get_attribute("#auto", "aria-pressed") == "false"
 
 
+SLOW = """() => {
+    const load = stad.loadTensors
+    stad.loadTensors = async (name) => {
+        await new Promise((done) => (globalThis.arrive ??= []).push(done))
+        return load(name)
+    }
+}"""
+
+
+def test_no_race_begins_before_a_rival_that_loads_slowly_is_there(opened):
+    page = opened("race", reduced_motion="reduce")
+    phase(page, "attract")
+    page.evaluate(SLOW)
+    page.select_option("#agent", "input")
+    page.focus("#seat")
+    page.keyboard.press("ArrowUp")
+    assert stays(page, "attract") and "is being loaded" in page.inner_text("#card-way")
+    page.evaluate("arrive.forEach((done) => done())")
+    page.wait_for_function("!document.querySelector('#card-way').textContent.includes('loaded')")
+    page.keyboard.press("ArrowUp")
+    phase(page, "race")
+    page.wait_for_function("stad.page.state.you.frames > 10")
+
+
 def test_the_easy_way_gives_no_gas_above_60_until_it_is_switched_off(opened):
     page = opened("race")
     page.keyboard.down("ArrowUp")

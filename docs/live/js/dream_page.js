@@ -136,7 +136,9 @@ stad.start(async () => {
       dream
         ? `the dream, frame ${dream.frames}, ${wheel}, ${pedals}` +
             (distance ? `, distance from the recorded episode ${distance}` : "")
-        : `reconstruction of frame ${t} by V, ${pedals}`,
+        : encoded?.latents[t]
+          ? `reconstruction of frame ${t} by V, ${pedals}`
+          : `frame ${t}, which V has not read yet, ${pedals}`,
     );
     if (!dream) return;
     const at = `after ${dream.frames} frames`;
@@ -289,7 +291,8 @@ stad.start(async () => {
     if (event.repeat || event.ctrlKey || event.altKey || event.metaKey) return;
     const sits = get("seat").contains(document.activeElement);
     const free = document.activeElement === document.body;
-    if (event.key.toLowerCase() === "p" && (sits || free)) return togglePlay(event);
+    const near = free || get("live").contains(document.activeElement);
+    if (event.key.toLowerCase() === "p" && near) return togglePlay(event);
     if (event.key !== "Escape" || !(drives() || sits)) return;
     document.activeElement.blur();
     if (dream && driver === "hand") setPlaying(false);

@@ -100,6 +100,7 @@ stad.start(async () => {
     stad.evolveSettings.show(settings);
     if (!kept) stad.evolveSettings.drop(settings);
     show();
+    mend();
     if (wanted > 0) go(wanted); // an impatient reader has pressed Start meanwhile
   }
 
@@ -141,6 +142,10 @@ stad.start(async () => {
     const inputs = INPUTS[settings.sees];
     view.show({ log, states, finished, bet, settings, inputs });
     showButtons();
+  }
+
+  /** What failed is over when the reader goes on, or a fresh start has succeeded. */
+  function mend() {
     if (get("live").dataset.state === "failed") stad.recover();
   }
 
@@ -149,6 +154,7 @@ stad.start(async () => {
     get("run").textContent = driving && paused === null ? "Pause" : begun ? "Go on" : "Start";
     get("bet-value").textContent = bet ?? "?";
     get("bet").value = bet ?? 1;
+    get("bet").setAttribute("aria-valuetext", bet ?? "no bet yet");
     get("bet").disabled = begun;
     get("download").disabled = get("race").hidden = log.length === 0;
     const { seed, agent } = settings;
@@ -169,6 +175,7 @@ stad.start(async () => {
 
   /** Drive so many more generations. */
   function go(count) {
+    mend();
     wanted = count;
     setPaused(false);
     driving ??= drive()

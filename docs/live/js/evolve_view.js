@@ -127,7 +127,7 @@ globalThis.stad ??= {};
           `Complete laps: ${last.laps} of ${settings.population}. σ ${sigma}.`
         : "Nobody has driven yet.";
       get("summary").textContent = text;
-      const time = (count) => `${total("seconds", count).toFixed(0)} seconds`;
+      const time = (count) => `${total("seconds", count).toFixed(1)} seconds`;
       const driven = `${total("frames").toLocaleString("en")} frames in ${time()}.`;
       get("driven").textContent = number ? driven : "";
       const said = bet ? `You said ${bet}: the` : "The";

@@ -20,6 +20,17 @@ stad.COLORS = {
   sky: "#56B4E9",
 };
 
+// A script that does not arrive starts no page.
+addEventListener(
+  "error",
+  ({ target }) => {
+    const waits = target.tagName === "SCRIPT" && stad.get("live")?.dataset.state === "loading";
+    if (waits && stad.get("message"))
+      stad.get("message").textContent = "A script did not arrive. Please reload the page.";
+  },
+  true,
+);
+
 {
   const SECOND = 1000; // milliseconds between two texts, so that a screen reader keeps up
 

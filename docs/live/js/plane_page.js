@@ -48,6 +48,9 @@
   /** Whether the points hardly differ any more. */
   const finished = () => strategy.ellipse().long < 1e-7 || strategy.generation >= 300;
 
+  /** Where the mean is, in words. */
+  const place = () => strategy.mean.map((value) => stad.fixed(value, 2)).join(", ");
+
   function show() {
     drawPlane();
     drawProgress();
@@ -58,8 +61,7 @@
       `ellipse ${short3(long)} by ${short3(short)}.` +
       (finished() ? ` Finished${atMinimum()}.` : "");
     stad.get("state").textContent = text;
-    const at = strategy.mean.map((value) => value.toFixed(2)).join(", ");
-    stad.describe(plane, `${landscape.name}, from above. ${text} The mean is at ${at}.`);
+    stad.describe(plane, `${landscape.name}, from above. ${text} The mean is at ${place()}.`);
     stad.get("step").setAttribute("aria-disabled", finished()); // not `disabled`: the focus stays
     if (finished()) stop();
   }
@@ -223,7 +225,7 @@
     const move = moves[event.key];
     if (move) {
       begin(start[0] + 0.05 * move[0], start[1] + 0.05 * move[1]);
-      stad.announce(`The start is at ${strategy.mean.map((one) => one.toFixed(2)).join(", ")}.`);
+      stad.announce(`The start is at ${place()}.`);
     } else if (event.key === "Enter" || event.key === " ") stepAloud();
     else return;
     event.preventDefault(); // arrow keys and the space bar would move the page

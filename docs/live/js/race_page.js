@@ -43,11 +43,14 @@ stad.start(async () => {
   }
 
   let wishes = 0; // rivals that were wished for
-  let missing = false; // whether the files of the last one did not arrive
+  let coming = false; // whether the files of the last one are on their way
+  let missing = false; // whether they did not arrive
 
   /** Let the chosen rival drive. */
   async function change() {
     const own = ++wishes;
+    coming = true;
+    showWay();
     try {
       await choose(agent);
       if (own !== wishes) return; // another one was chosen meanwhile
@@ -58,6 +61,9 @@ stad.start(async () => {
       if (own !== wishes) return;
       missing = true;
       stad.fail(error);
+    } finally {
+      if (own === wishes) coming = false;
+      showWay();
     }
   }
 
@@ -160,11 +166,12 @@ stad.start(async () => {
 
   /** How the reader begins or goes on, now: the last sentence of the card. */
   function showWay() {
+    if (coming) return set("card-way", "The agent is being loaded.");
     const keys = {
       attract: ["Touch the picture or press the up arrow", "to race it"],
       paused: ["Press P or an arrow key", "to go on"],
       over: ["Press the up arrow", "to race again"],
-    }[state.phase];
+    }[state?.phase];
     if (!keys) return set("card-way", "");
     const way = touching ? "Touch the picture" : released ? "Click the picture" : keys[0];
     set("card-way", `${way} ${keys[1]}.`);
@@ -243,6 +250,7 @@ stad.start(async () => {
   }
 
   function begin() {
+    if (coming) return; // the files would end the race when they arrive
     released = false;
     wake();
     setAuto(false);
@@ -313,6 +321,7 @@ stad.start(async () => {
 
   /** A driver has touched a pedal: begin, or go on. */
   function wish() {
+    if (coming) return; // as above
     released = false;
     if (state?.phase === "attract") begin();
     else if (state?.phase === "paused") setPaused(false);
@@ -496,6 +505,7 @@ stad.start(async () => {
 
   await choose(agent);
   drive(seed);
+  rest(); // a tab that was opened in the background has no observer yet
   await new Promise((done) => {
     const timer = setInterval(() => state && track && (clearInterval(timer), done()), 10);
   });

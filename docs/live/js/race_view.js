@@ -187,19 +187,22 @@ globalThis.stad ??= {};
       top + within(8 + (high - y) * scale, tall),
     ];
     context.fillStyle = "#fffd";
-    context.beginPath();
-    context.roundRect(width - side - 8, top, side, tall, 8);
-    context.fill();
+    fillBox(context, width - side - 8, top, side, tall, 8);
     stad.strokeLine(context, [...line, line[0]].map(place), "#777", 3);
     stad.fillDot(context, place([cars.rival.x, cars.rival.y]), 5, BLUE);
     if (cars.you) stad.fillDot(context, place([cars.you.x, cars.you.y]), 5, ORANGE);
   }
 
+  /** Fill a box with round corners; browsers before 2022 draw none. */
+  function fillBox(context, ...sizes) {
+    context.beginPath();
+    (context.roundRect ?? context.rect).apply(context, sizes);
+    context.fill();
+  }
+
   function drawSpeed(context, height, speed) {
     context.fillStyle = "#000a";
-    context.beginPath();
-    context.roundRect(8, height - 44, 132, 36, 8);
-    context.fill();
+    fillBox(context, 8, height - 44, 132, 36, 8);
     context.fillStyle = "#fff";
     context.font = "600 15px system-ui, sans-serif";
     context.textAlign = "left";
@@ -226,9 +229,7 @@ globalThis.stad ??= {};
     context.font = LARGE;
     context.textAlign = "center";
     context.fillStyle = "#000b";
-    context.beginPath();
-    context.roundRect(width / 2 - 130, 0.4 * height - 25, 260, 62, 10);
-    context.fill();
+    fillBox(context, width / 2 - 130, 0.4 * height - 25, 260, 62, 10);
     context.fillStyle = "#fff";
     context.fillText("Hold a side to steer.", width / 2, 0.4 * height);
     context.fillText("Gas comes by itself.", width / 2, 0.4 * height + 24);
