@@ -79,7 +79,7 @@ class Prediction(ipywidgets.VBox):
         if self.answer is None:
             asked = "<summary>Show the result, without a prediction</summary>"
             return panel(BLUE, f"<details>{asked}{found}</details>")
-        right = self.answer == result
+        right = self.text(self.answer) == self.text(result)  # their last bits may differ
         mark = " &#10003;" if right else ""  # a tick
         color = GREEN if right else BLUE
         return panel(color, f"Your prediction: {self.text(self.answer)}.{mark}", found)
@@ -98,7 +98,7 @@ def predict(
     low, high = (cast(float, limit) for limit in options)
     whole = isinstance(low, int) and isinstance(high, int)
     kind = ipywidgets.IntSlider if whole else ipywidgets.FloatSlider
-    step = 1 if whole else (high - low) / 100
+    step = 1 if whole else 0.01 if high <= 1 else 0.1  # results are rounded to these
     control = kind(low, min=low, max=high, step=step, description=unit)
     return Prediction(question, control, f"{low} to {high} {unit}".rstrip(), unit)
 

@@ -69,7 +69,7 @@
 
   window.addEventListener("blur", pause);
   document.addEventListener("visibilitychange", () => document.hidden && pause());
-  document.addEventListener("focusin", () => typing() && running() && pause());
+  document.addEventListener("focusin", () => typing() && pause());
   picture.addEventListener("click", () => running() || go.click());
   const drives = ".stad-lab-drive, .stad-lab-again, .stad-lab-begin";
   seat.addEventListener("click", ({ isTrusted, target }) => {

@@ -39,6 +39,15 @@ def test_a_result_stays_folded_for_who_has_made_no_prediction(capsys):
     assert "20 metres" in shown(guess)
 
 
+@pytest.mark.parametrize(("limits", "result"), [((-0.25, 1.0), 0.63), ((1.0, 10.0), 7.6)])
+def test_a_slider_reaches_the_result_and_is_then_right(limits, result):
+    guess = predict("How much?", limits)
+    steps = round((result - guess.control.min) / guess.control.step)
+    guess.control.value = guess.control.min + steps * guess.control.step
+    guess.reveal(result)
+    assert f"{result}. &#10003;" in shown(guess)
+
+
 def test_a_page_without_a_kernel_shows_the_question_and_its_choices():
     text = predict("What will it do?", ["spin", "stop"])._repr_mimebundle_()["text/html"]
     assert "What will it do?" in text and "spin / stop" in text
