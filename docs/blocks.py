@@ -102,11 +102,11 @@ def gains(claims: dict) -> str:
         told.append(f"{name_verdict(one)} ({round(one['difference'])} points)")
     both, alone = told
     if out_of_reach(study, "z, h"):
-        both += "; the paper's gain would exceed our best runs"
+        both += "; the paper's gain would lie above our best runs"
     return (
         "Does it help to see and reconstruct what has moved? A paper says so. We trained agents"
-        " with and without it twelve times each. If the driver sees the memory, as in World"
-        f" Models: {both}. If not: {alone}."
+        " with and without it twelve times each. If the driver also sees the memory of earlier"
+        f" frames, as in World Models: {both}. If it sees the present one alone: {alone}."
     )
 
 
@@ -506,17 +506,19 @@ def commands_table(claims: dict) -> str:
 def faster_recipe(claims: dict) -> str:
     """What study 6 says of the preset `fast`."""
     found = claims["study6"]
-    outcome = "does not" if found["not_worse"] else "may"
+    outcome = "ruled out" if found["not_worse"] else "not ruled out"
     pairs, seeds = len(found["scores"]["study6_fast"]), len(STUDIES["study6_fast"].seeds)
     return (
         "With V and M trained on one core, a run took"
         f" {found['minutes']['study6_fast']:.0f} minutes with `fast` and"
         f" {found['minutes']['study6_laptop']:.0f} with `laptop` (medians)."
-        f" `fast` {outcome} lose {MARGIN} points or more against `laptop` ([study"
-        f" 6](protocol.md#study-6-a-faster-recipe)): over {pairs} pairs the mean difference is"
-        f" {found['difference']:+.1f}, and its one-sided 95% bound {found['lower_bound']:+.1f}."
-        f" From the means of {seeds} seeds the bound is {found['lower_bound_of_seeds']:+.1f}."
-        f" (Standard deviation {found['deviation']:.0f}; `frame` and `input_output`, z and h.)"
+        f" The mean difference of their scores, `fast` minus `laptop`, is"
+        f" {found['difference']:+.1f} points over {pairs} pairs; a loss of {MARGIN} points or more"
+        f" is {outcome}."
+        f" ([Study 6](protocol.md#study-6-a-faster-recipe): the one-sided 95% bound is"
+        f" {found['lower_bound']:+.1f}, from the means of {seeds} seeds"
+        f" {found['lower_bound_of_seeds']:+.1f}; standard deviation {found['deviation']:.0f};"
+        " `frame` and `input_output`, z and h.)"
     )
 
 

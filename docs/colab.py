@@ -15,6 +15,7 @@ import nbformat
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
 BRANCH = "colab"  # on which the workflow publishes FOLDER
 SETUP = """# Google Colab: fetch the repository, and install it into Colab's own Python
+%cd -q /content
 !git clone -q --depth 1 https://github.com/{repository} stad_lab
 %pip install -q "./stad_lab[train]"
 %cd -q stad_lab/notebooks"""

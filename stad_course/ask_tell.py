@@ -79,4 +79,6 @@ def problem_of_tell(own: Tell) -> str:
         if np.allclose(found, wrong):
             return problem
     right = np.allclose(found, tell(candidates, returns))
-    return "" if right else "tell is not the mean of the best quarter"
+    quarter = len(returns) // 4
+    problem = f"tell must average the best quarter, here {quarter} of {len(returns)}"
+    return "" if right else problem

@@ -28,7 +28,8 @@ MODULES = (
     *("safetensors", "psutil", "tyro", "numba", "tqdm", "filelock", "threadpoolctl"),
     *("matplotlib", "PIL", "ipywidgets"),
 )
-NEEDED = ("", "train", "lab")  # extras without which a notebook does not run
+COLAB = "google.colab" in sys.modules  # its own notebook packages are older, and do
+NEEDED = ("", "train") if COLAB else ("", "train", "lab")  # without which a notebook does not run
 OPTIONAL_MODULES = ("distributed",)  # of the other extras
 
 

@@ -191,11 +191,11 @@ def rollout(
     """Drive one episode with each car of a batch.
 
     Args:
-        driver: is shown what the cars see whose episodes go on.
+        driver: sees the pictures of the cars that still drive.
         batch: of cars at the start of their episodes.
         max_frames: of an episode, at most 1,000 as in CarRacing.
         patience: maximum number of frames without a new tile; 0 for no limit.
-        observe: called before every step with the numbers of the cars, what they see, and actions.
+        observe: called before every step with the cars' indices, what they see, and actions.
     """
     max_frames = whole_number("max_frames", max_frames, 1)
     patience = whole_number("patience", patience)

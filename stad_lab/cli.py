@@ -130,9 +130,9 @@ def fine_tune(
     Args:
         run: A shipped agent, or the folder of a finished run.
         out: Folder of the fine-tuned run.
-        generations: Of CMA-ES, a multiple of 5; 15 if not given.
+        generations: Generations of CMA-ES, a multiple of 5; 15 if not given.
         sigma: Initial step size; 0.02 if not given.
-        seed: Of the candidates and tracks; the run's own if not given.
+        seed: Seed of the candidates and tracks; the run's own if not given.
         processes: Workers that drive.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
@@ -165,7 +165,7 @@ def evaluate(
         agent: A shipped agent, or the folder of a run.
         episodes: Number of episodes, one on each track.
         first_track: Seed of the first track.
-        fast: Drive in our engine instead of Gymnasium (not for scores that you report).
+        fast: Drive in our engine, not in Gymnasium (do not compare with the scores in README.md).
         processes: Workers that drive.
         json: Where to write every episode; by default into the run, or here for a shipped agent.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
@@ -208,11 +208,11 @@ def verify(run: str) -> int:
 def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None = None) -> None:
     """Measure what the latents of a run carry of the car's motion, with a linear probe.
 
-    It needs V and M alone, and takes a few minutes.
+    It needs only V and M, and takes a few minutes.
 
     Args:
         run: A shipped agent, or the folder of a run.
-        episodes: Of the random driver; an agent drives a third as many, at least 12.
+        episodes: Episodes of the random driver; an agent drives a third as many, at least 12.
         processes: Workers that drive.
         json: Where to write the result; by default into the run, or here for a shipped agent.
     """
@@ -230,7 +230,7 @@ def probe(run: str, episodes: int = 180, processes: int = 2, json: Path | None =
 
 
 def report(run: str, out: Path | None = None) -> None:
-    """Write a page about a run, finished or not: scores, film, curves, and what made it.
+    """Write a page about a run, finished or not: scores, film, curves, settings, versions.
 
     Args:
         run: A shipped agent, or the folder of a run.

@@ -7,8 +7,8 @@
     run         minutes of whole runs of two presets, from nothing to the evaluated agent
 
 Speeds depend on the machine, so contenders do the same work in turns, in alternating order, and the
-median of the rounds counts. On an otherwise idle machine the run takes about twenty minutes, and
-all else about ten.
+median of the rounds counts. On an otherwise idle machine the run takes about half an hour, and
+all else about ten minutes.
 """
 
 import cProfile
@@ -74,7 +74,7 @@ def benchmark(parts: list[str], rounds: int = 5, file: Path | None = None) -> di
         file: where to write the result, after every part; None for nowhere.
 
     Returns:
-        What it was made with, and for each part its tables with every measurement.
+        What it was made with, and the tables of each part; of contenders every measurement.
 
     Raises:
         ValueError: an unknown part, or fewer than 1 round.
@@ -151,7 +151,7 @@ def measure_parity(rounds: int) -> dict:
 
 
 def measure_renderer(rounds: int) -> dict:
-    """Frames a second on one core, whole random episodes, resets included.
+    """Frames a second on one core with random driving, resets included.
 
     EnvPool has its own tracks and a simpler picture: it does about the same work.
     """

@@ -168,7 +168,7 @@ def latents(
 
     Args:
         out: Folder for what is trained, and for latents.json.
-        preset: Of what is trained.
+        preset: Preset of what is trained.
         parts: What to measure; all if not given.
         dataset: Folder of the dataset; OUT/dataset if not given.
     """
@@ -210,7 +210,7 @@ def ship(run: str, name: str) -> None:
 
     Args:
         run: Folder of the run.
-        name: Of the shipped agent.
+        name: Name of the shipped agent.
     """
     from stad_study.ship import ship
 

@@ -60,7 +60,7 @@ def describe_repetition(one: dict) -> str:
 def describe_ceiling(study: dict) -> str:
     """Where the gain of the paper was out of reach, for the overview; else nothing."""
     seen = " or ".join(name.replace(", ", " and ") for name in SEES if out_of_reach(study, name))
-    return f"With {seen} the paper's gain would exceed our best runs." if seen else ""
+    return f"With {seen} the paper's gain lies above our best runs." if seen else ""
 
 
 def describe_others(study: dict) -> str:
@@ -70,7 +70,7 @@ def describe_others(study: dict) -> str:
     if "gain" in verdicts:
         return ""
     undecided = f"{verdicts.count('undecided')} of {len(verdicts)} undecided"
-    return f"`input` and `output`: no gain ({undecided})."
+    return f"`input`, `output`: no gain shown ({undecided})."
 
 
 def out_of_reach(study: dict, features: str) -> bool:
@@ -97,7 +97,7 @@ def describe_paper_gain(study: dict) -> str:
         if features not in reached:
             baseline = study["arms"][f"{features}: frame"]["mean"]
             seen, best = features.replace(", ", " and "), f"{study['ceiling']:.0f}"
-            text += f" With {seen} such gains would exceed our best runs: `frame` has"
+            text += f" With {seen} such gains would lie above our best runs: `frame` has"
             text += f" {baseline:.0f} points, {low:.0f} more are {baseline + low:.0f}, and the"
             text += f" best of all pipelines on each track has {best} on average (computed"
             text += " afterwards)."
@@ -139,7 +139,7 @@ def read_cause(comparisons: dict[str, dict]) -> str:
     holds = {
         "difference images are worth more with z alone": more == "gain",
         f"adding the motion is a gain{opposite(adding, 'harm')}": adding == "gain",
-        f"erasing it is a harm{opposite(erasing, 'gain')}": erasing == "harm",
+        f"erasing the motion is a harm{opposite(erasing, 'gain')}": erasing == "harm",
         f"with the motion the variants are within {MARGIN} points (no test)": alike,
     }
     if all(holds.values()):

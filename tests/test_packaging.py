@@ -240,7 +240,7 @@ def test_in_new_environments_the_engine_drives_and_with_train_an_agent_does(tmp_
     source = shutil.copytree(
         ROOT, tmp_path / "source", ignore=shutil.ignore_patterns(".*", "notebooks", "docs", "build")
     )
-    python = tmp_path / "venv" / "bin" / "python"
+    python = tmp_path / "venv" / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
     run = {"check": True, "cwd": tmp_path, "timeout": 1800, "text": True}
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], **run)
     subprocess.run([python, "-m", "pip", "install", "-q", source, "moviepy"], **run)

@@ -4,7 +4,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from stad_course.checks.answers import WrongAnswer, ask, check, check_interval, to_numpy
+from stad_course.checks.answers import (
+    BY_SAMPLE,
+    WrongAnswer,
+    ask,
+    check,
+    check_interval,
+    to_numpy,
+)
 
 
 def right_weights(size: int) -> np.ndarray:
@@ -116,14 +123,14 @@ def expected_bests(expected_best: Callable) -> None:
     }
     what = "expected_best of two dice"
     found = ask(what, expected_best, dice, 2, np.random.default_rng(0))
-    check(what, found, 161 / 36, mistakes, tolerance=0.01)
+    check(what, found, 161 / 36, mistakes, 0.01, BY_SAMPLE)
     what = "expected_best of one die"
     mistakes = {
         "size is not used: sample `size` of the returns": 161 / 36,
         "this is the largest of all: take the mean over many samples": 6.0,
     }
     found = ask(what, expected_best, dice, 1, np.random.default_rng(0))
-    check(what, found, 3.5, mistakes, tolerance=0.02)
+    check(what, found, 3.5, mistakes, 0.02, BY_SAMPLE)
 
 
 def difference_intervals(difference_interval: Callable) -> None:

@@ -1,8 +1,8 @@
 """CarRacing-v3 as a Gymnasium environment on our engine, for one car.
 
 Returns, rewards and endings are those of Gymnasium's own CarRacing-v3, bit for bit on Linux x86-64,
-elsewhere to within rounding; the observation differs by less than 0.3 of 255 on average, in the
-usual colours. To drive many cars at once, see `envs.vector`.
+elsewhere until rounding errors grow; the observation differs by less than 0.3 of 255 on average, in
+the usual colours. To drive many cars at once, see `envs.vector`.
 """
 
 import inspect

@@ -1,8 +1,9 @@
 """Pictures of CarRacing: a texture of the track, one affine warp, then the car and the bar.
 
-Gymnasium draws some 800 polygons on 1000 x 800 window pixels for every observation and shrinks the
-result to 96 x 96. But the ground hardly changes within an episode, and the camera is fixed to the
-car. So we paint the ground once per episode into a texture; a picture then takes three steps:
+For every observation Gymnasium transforms some 800 polygons, draws those near a window of 1000 x
+800 pixels and shrinks it to 96 x 96. But the ground hardly changes within an episode, and the
+camera is fixed to the car. So we paint the ground once per episode into a texture; a picture then
+takes three steps:
 
 1. **Warp.** The camera's rotation, zoom and position make one affine map from the pixels of the
    picture to the texture (*inverse mapping*: for every pixel we ask which point of the ground it

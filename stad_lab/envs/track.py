@@ -8,7 +8,7 @@ A track is made in four steps.
    the path.
 3. One lap is cut out. If its two ends do not meet, the track is refused and drawn again.
 4. Every two neighbouring points of the path span a road tile. Where the road bends sharply, a tile
-   has a kerb on its outside.
+   has a kerb on the inside of the bend.
 
 The method and all constants are those of `CarRacing._create_track` in Gymnasium (Oleg Klimov). All
 arithmetic is float64 in the same order of operations. So all vertices are equal to the last bit

@@ -18,11 +18,12 @@ from stad_study.study5_claims import describe_study5
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import blocks
 
-EFFECTS = {"z + motion": 40, "z - motion": -40}  # points
+EFFECTS = {"z + motion": 40, "z + placebo": 15, "z + action": 35}  # points
+EFFECTS |= {"z - motion": -40, "z - placebo": -15}
 
 
 def write_tables(folder, runs):
-    """Tables in which motion earns 40 points, and input_output another 20."""
+    """Tables in which motion earns 25 points more than a placebo, and input_output another 20."""
     rng, lines = np.random.default_rng(0), []
     for run in runs:
         mean = 800 + EFFECTS.get(run.sees, 0) + 20 * (run.variant == "input_output")
@@ -117,7 +118,7 @@ def test_effects_are_found_and_corrected_within_their_family(described):
     found = described["comparisons"]
     expected = {"interaction": 0, "input_output less input": 20, "both with motion": 20}
     expected |= {"effect with z": 20, "effect with z and h": 20}
-    expected |= {"adding motion": 40, "erasing motion": -40, "remembering the action": 0}
+    expected |= {"adding motion": 25, "erasing motion": -25, "remembering the action": 20}
     for name, points in expected.items():
         assert found[name]["difference"] == pytest.approx(points, abs=8), name
         assert len(found[name]["by_seed"]) == 12

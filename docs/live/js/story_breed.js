@@ -49,7 +49,7 @@ stad.figure("breed", async (part) => {
     const points = planted ? `, ${facts.returns[i].toFixed(0)} points` : "";
     const lap = planted ? (facts.laps[i] ? ", a complete lap" : ", no complete lap") : "";
     const told = `${generations[i]}${points}${lap}`;
-    const drives = "recorded drives of the start and 24 generations";
+    const drives = "recorded episodes of the start and 24 generations";
     stad.describe(part("map"), `${drives}; generation ${told}`);
     if (planted) part("summary").textContent = `Generation ${told}.`;
     draw();

@@ -9,7 +9,7 @@ stad.figure("eye", async (part) => {
   const pictures = await drive();
   let [place, z, guessed] = [0, null, false];
 
-  /** Frames of the agent's own drive on a track, with z of each. */
+  /** Frames of the agent's own episode on a track, with z of each. */
   async function drive() {
     const [TRACK, FIRST, EVERY, LAST] = [7, 90, 60, 480];
     const engine = await stad.loadEngine();

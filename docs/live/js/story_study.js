@@ -53,7 +53,7 @@ stad.figure("study", async (part) => {
     });
     const text = `${told.join(". ")}. The paper: ${paper} points`;
     part("answer").textContent =
-      "Hardly any, on average. If it sees z alone it is more: see below.";
+      "Hardly any, on average. More if the driver sees z alone: open What we found.";
     stad.describe(part("chart"), text);
     stad.announce(text);
     part("after").hidden = part("paper").hidden = false;
