@@ -243,8 +243,8 @@ def report(run: str, out: Path | None = None) -> None:
 
     folder = run_folder(run)
     read_record(folder)
-    shipped = folder.resolve().parent == PRETRAINED.resolve()
-    file = out or (Path(f"report-{folder.name}.html") if shipped else folder / "report.html")
+    shipped, name = folder.resolve().parent == PRETRAINED.resolve(), folder.resolve().name
+    file = out or (Path(f"report-{name}.html") if shipped else folder / "report.html")
     if file.suffix.lower() != ".html":
         raise ValueError(f"--out {file}: expected a .html")
     check_writable(file)

@@ -1,5 +1,6 @@
 """The live pages in a headless Chromium, from the disk: V, M, C and the dream equal the Python."""
 
+import os
 import shutil
 import subprocess
 import time
@@ -208,6 +209,7 @@ def test_the_reader_closes_the_eyes_drives_and_opens_them_with_the_keyboard_alon
     running = page.evaluate("stad.page.clock.running")
     page.keyboard.press("p")
     assert page.evaluate("stad.page.clock.running") is not running
+    page.keyboard.press("p")  # the dream goes on
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Escape")  # gives the keys back, and the dream waits
     page.evaluate("scrollTo(0, 0)")
@@ -288,6 +290,15 @@ def test_after_a_network_that_does_not_arrive_another_one_can_be_chosen(name, op
     page.evaluate(CHOOSE[name], "input")
     page.wait_for_selector("#live[data-state=ready]")
     assert page.is_hidden("#message")
+
+
+def test_a_page_whose_script_does_not_arrive_says_so(browser, live_pages, tmp_path):
+    folder = shutil.copytree(live_pages, tmp_path / "live", copy_function=os.link)
+    (folder / "js" / "frames.js").unlink()
+    page = browser.new_page()
+    page.goto((folder / "dream.html").as_uri())
+    page.wait_for_selector("#live[data-state=failed]")
+    assert page.inner_text("#message") == "A script did not arrive. Please reload the page."
 
 
 READY = """async () => {

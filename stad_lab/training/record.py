@@ -58,7 +58,8 @@ def read_finished(earlier: Path) -> dict:
     record = read_record(earlier)
     log = load_json(earlier / LOG, GIVE_A_RUN, kind="evolution")
     done, asked = len(log["generations"]), log["evolution"]["generations"]
-    if done != asked or "budget" not in record:
+    driven = sum(len(one["returns"]) for one in log["generations"])
+    if done != asked or record.get("budget", {}).get("agents") != driven:
         found = f"with {done} of {asked} generations: run its own command to the end first"
         raise ValueError(f"the run in {earlier} is not finished, {found}")
     return record

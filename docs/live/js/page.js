@@ -20,13 +20,14 @@ stad.COLORS = {
   sky: "#56B4E9",
 };
 
-// A script that does not arrive starts no page.
+// What a page stumbles over when it lacks a script says nothing to its reader.
 addEventListener(
   "error",
   ({ target }) => {
     const waits = target.tagName === "SCRIPT" && stad.get("live")?.dataset.state === "loading";
-    if (waits && stad.get("message"))
-      stad.get("message").textContent = "A script did not arrive. Please reload the page.";
+    if (!waits || !target.src.includes("/js/")) return; // data has a message of its own
+    stad.lost = "A script did not arrive. Please reload the page.";
+    stad.get("message").textContent = stad.lost;
   },
   true,
 );
@@ -72,7 +73,8 @@ addEventListener(
   /** Show an error as a sentence. */
   stad.fail = (error) => {
     stad.get("message").hidden = false;
-    stad.get("message").textContent = `This part of the page does not work. ${error.message}`;
+    stad.get("message").textContent =
+      stad.lost ?? `This part of the page does not work. ${error.message}`;
     stad.get("live").dataset.state = "failed";
     console.error(error);
   };
