@@ -20,7 +20,7 @@ import numpy as np
 import torch
 
 from stad_lab.agent import PRETRAINED
-from stad_lab.config import VARIANTS, Config, check_same, random_stream
+from stad_lab.config import PRESETS, VARIANTS, Config, check_same, random_stream
 from stad_lab.envs.frames import earlier_frames
 from stad_lab.evaluation import metrics
 from stad_lab.evaluation.probe_run import (
@@ -82,6 +82,9 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[st
         raise ValueError(f"unknown part {unknown[0]!r}: choose from {', '.join(PARTS)}")
     if (file := work / "latents.json").exists():
         load_json(file)  # before any work: it may be damaged
+    preset = next((f" --preset {name}" for name, one in PRESETS.items() if one == config), "")
+    command = f"python -m stad_study latents{preset} --out ... --parts "
+    made_with = provenance(command)  # before the work: the checkout may change meanwhile
     collect(config, dataset_folder)
     count = max(FEWEST_TRAJECTORIES, config.data.episodes // 5)
     driven = random_trajectories(count, config.seed + 1, config.processes)
@@ -89,7 +92,7 @@ def measure(config: Config, dataset_folder: Path, work: Path, parts: Sequence[st
     for name in parts:
         found = PARTS[name](given)
         found |= {"trajectories": len(driven), "config": config.as_dict()}
-        found["made_with"] = provenance(f"python -m stad_study latents --parts {name} --out ...")
+        found["made_with"] = made_with | {"command": command + name}
         result[name] = found
         save_json(file, (load_json(file) if file.exists() else {}) | result)
     return result

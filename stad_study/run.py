@@ -99,13 +99,13 @@ def drive_baseline(name: str, folder: Path, executor: Executor | None) -> None:
     """Drive the tracks of the evaluation blindly; writes the evaluation and a record."""
     if (folder / EVALUATION).exists():
         return
+    made_with = provenance(f"python -m stad_study replicate {name} --out ...")  # before the work
     begin, tracks = time.perf_counter(), list(range(TRACKS))
     with worker_threads(Config().processes, executor) as executor:
         tasks = [(name, track) for track in tracks]
         returns, lengths = zip(*run_in_order(executor, drive_blindly, tasks, name), strict=True)
     found = {"kind": KIND, "variant": name, "renderer": "none"}
     found |= report(tracks, np.array(returns), np.array(lengths))
-    made_with = provenance(f"python -m stad_study replicate {name} --out ...")
     record = {"kind": "record", "variant": name, "made_with": made_with, "budget": {}}
     save_json(folder / RECORD, record)
     save_json(folder / EVALUATION, found | {"seconds": time.perf_counter() - begin})

@@ -15,7 +15,7 @@ from nbclient import NotebookClient
 from stad_lab.envs import frames
 
 COURSE = Path(__file__).parent.parent / "notebooks" / "exercises"
-NAMES = sorted(folder.name for folder in (COURSE / "source").iterdir())
+NAMES = sorted(folder.name for folder in (COURSE / "source").glob("0*"))
 SOURCES = {name: COURSE / "source" / name / f"{name}.ipynb" for name in NAMES}
 NOTEBOOKS = [*SOURCES.values(), *(COURSE / f"{name}.ipynb" for name in NAMES)]
 

@@ -1,5 +1,6 @@
 """The live pages on speeds, the KL weight and evolution: opened from the disk in a Chromium."""
 
+import base64
 import json
 import sys
 from pathlib import Path
@@ -123,6 +124,16 @@ def test_a_recorded_path_is_what_its_controller_drives():
     begin = sum(facts["tracks"][0]["points"][:-1])
     recorded = tensors["paths.0"][begin : begin + 16]  # one in five frames
     np.testing.assert_allclose(places[:: facts["every"]], recorded, atol=0.3)  # of half precision
+
+
+def test_the_recorded_drive_is_that_of_the_shipped_agent():
+    facts = json.loads((LIVE / "data" / "drive.json").read_text("utf-8"))
+    actions = np.frombuffer(base64.b64decode(facts["actions"]), "<f4").reshape(-1, 3)
+    sheet, agent = np.asarray(Image.open(LIVE / "data" / "drive.webp")), load_agent(facts["agent"])
+    for t in range(facts["columns"]):  # the first row of the picture
+        frame = sheet[:64, 64 * t : 64 * (t + 1)].copy()
+        acted = agent.act_batch(frame[None])[0]
+        np.testing.assert_allclose(acted, actions[t], atol=1e-2, err_msg="run record.py")
 
 
 def test_the_frames_of_the_speeds_are_those_that_the_engine_draws(rng):

@@ -44,7 +44,8 @@ MEASURE = """async ([name, track, seconds]) => {
 
 def launch(playwright: Playwright) -> Browser:
     """The Chromium of this machine."""
-    path = shutil.which("chromium") or shutil.which("google-chrome")
+    names = ("chromium", "chromium-browser", "google-chrome")  # as tests/conftest.py
+    path = next(filter(None, map(shutil.which, names)), None)
     return playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
 
 

@@ -30,11 +30,10 @@ def generate(target: Path) -> list[Path]:
     Raises:
         RuntimeError: nbgrader refuses a source notebook; its log says why.
     """
+    target.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
-        shutil.copytree(
-            COURSE / "source", root / "source", ignore=shutil.ignore_patterns(".ipynb_checkpoints")
-        )
+        shutil.copytree(COURSE / "source", root / "source", ignore=shutil.ignore_patterns(".*"))
         shutil.copy(COURSE / "nbgrader_config.py", root)
         course, made = load_course(root), []
         for source in sorted((root / "source").iterdir()):

@@ -13,6 +13,11 @@ from pathlib import Path
 from nbgrader.api import Gradebook, MissingEntry
 
 
+def points_by_hand(grade) -> float:
+    """What a person gave for a cell: points, and extra credit."""
+    return (grade.manual_score or 0.0) + (grade.extra_credit or 0.0)
+
+
 def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]]:
     """Points of an assignment: student -> (the machine's, a person's, number of unread answers).
 
@@ -23,9 +28,7 @@ def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]
         machine = sum(
             grade.auto_score or 0.0 for grade in submission.grades if grade.manual_score is None
         )
-        person = sum(
-            (grade.manual_score or 0.0) + (grade.extra_credit or 0.0) for grade in submission.grades
-        )
+        person = sum(map(points_by_hand, submission.grades))
         found[submission.student.id] = (
             machine,
             person,
@@ -35,7 +38,7 @@ def marks(gradebook: Gradebook, name: str) -> dict[str, tuple[float, float, int]
 
 
 def manual_on_machine_cells(gradebook: Gradebook, name: str) -> list[tuple[str, str, float]]:
-    """Manual scores where the machine grades: (student, cell, points).
+    """Points by hand where the machine grades: (student, cell, points).
 
     A person may have given them, but so may a submission: it runs on the account that grades, and
     can leave a process behind that edits gradebook.db.
@@ -43,10 +46,10 @@ def manual_on_machine_cells(gradebook: Gradebook, name: str) -> list[tuple[str, 
     notebook = gradebook.find_notebook(name, name)
     by_hand = {cell.name for cell in notebook.solution_cells}
     return [
-        (submission.student.id, grade.name, grade.manual_score)
+        (submission.student.id, grade.name, points_by_hand(grade))
         for submission in gradebook.notebook_submissions(name, name)
         for grade in submission.grades
-        if grade.manual_score is not None and grade.name not in by_hand
+        if (grade.manual_score is not None or grade.extra_credit) and grade.name not in by_hand
     ]
 
 
@@ -72,7 +75,8 @@ if __name__ == "__main__":
         description="Print the marks of an assignment that nbgrader has graded, as CSV."
     )
     parser.add_argument("name", help="of the assignment, for example 01_difference_images")
+    found = read_marks(parser.parse_args().name)
     table = csv.writer(sys.stdout, lineterminator="\n")
     table.writerow(["student", "machine", "person", "mark", "unread"])
-    for student, (machine, person, unread) in sorted(read_marks(parser.parse_args().name).items()):
+    for student, (machine, person, unread) in sorted(found.items()):
         table.writerow([student, machine, person, machine / 2 + person, unread])

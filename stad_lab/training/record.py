@@ -149,7 +149,7 @@ def option_of(name: str, value: object) -> str:
 
 def provenance(command: str) -> dict:
     """What a result was made with: versions, machine, command, and the commit of a checkout."""
-    changed = git("status", "--porcelain", "--untracked-files=no", "--", "*.py")
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", "*.py", ":/stad_*.py")
     return {
         "python": platform.python_version(),
         **{package: importlib.metadata.version(package) for package in PACKAGES},

@@ -48,6 +48,8 @@ def run(code, **environment):
 @pytest.fixture
 def read_only_package(tmp_path):
     """A folder with a copy of the package in which nothing can be kept."""
+    if os.name == "nt":
+        pytest.skip("Windows itself names the folder of a user's cache")
     shutil.copytree(
         Path(stad_lab.__file__).parent / "envs",
         tmp_path / "stad_lab" / "envs",

@@ -3,6 +3,7 @@
 import threading
 
 import numpy as np
+import pygame
 import pytest
 
 from stad_lab.envs import physics, picture
@@ -192,14 +193,6 @@ def repeat(painter, count):
     return batch
 
 
-def test_without_the_bar_only_the_bar_is_missing(painter):
-    painter.env.reset(seed=7)
-    with_bar, without = painter.draw(96), painter.draw(96, bar=False)
-    assert np.array_equal(with_bar[:BAR_TOP], without[:BAR_TOP])
-    assert with_bar[BAR_TOP:].any()
-    assert not without[BAR_TOP:].any()
-
-
 def test_a_track_painted_over_another_looks_as_if_painted_on_fresh_ground(painter):
     painter.env.reset(seed=8)
     for _ in range(20):
@@ -258,11 +251,10 @@ def test_random_colours_reach_the_picture():
 @pytest.mark.parametrize("reward", [-999, -100.5, -23.4, -0.6, -0.4, -0.0, 0.4, 0.5, 7.5, 999.6])
 def test_the_score_is_the_text_that_python_prints(reward):
     pictures = picture.make_pictures()
-    index = picture.score_index(float(reward))
-    value = index + picture.MIN_SCORE
-    text = "-000" if index == picture.MINUS_ZERO else f"{value:04d}"
-    assert text == f"{reward:04.0f}"
-    assert pictures.score[index].any()
+    font = pygame.font.Font(pygame.font.get_default_font(), 42)
+    expected = picture.score_picture(font, f"{reward:04.0f}")
+    assert np.array_equal(pictures.score[picture.score_index(float(reward))], expected)
+    assert expected.any()
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e30])

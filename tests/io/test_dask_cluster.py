@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -95,8 +96,16 @@ def test_what_is_shared_is_sent_once_to_every_worker_and_not_with_each_task(sche
         assert client.amm.running()  # again, as it was before
 
 
+@contextmanager
+def only_far():
+    """A pool of this machine's own workers is an error."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stad_lab.io.workers.check_count", None)
+        yield
+
+
 def test_an_evaluation_on_a_cluster_is_bit_identical(scheduler, straight_run):
-    with cluster(scheduler[0]) as executor:
+    with only_far(), cluster(scheduler[0]) as executor:
         far = evaluate(straight_run, 3, fast=True, executor=executor)
     with ThreadPoolExecutor(2) as executor:
         near = evaluate(straight_run, 3, fast=True, executor=executor)
@@ -106,7 +115,8 @@ def test_an_evaluation_on_a_cluster_is_bit_identical(scheduler, straight_run):
 def test_the_command_line_evolves_on_a_cluster(scheduler, quick_run, tmp_path):
     folder = start_of("controller", quick_run, tmp_path / "run")
     command = ["train", "quick", "--variant", "input_output", "--out", str(folder)]
-    assert main([*command, "--scheduler", scheduler[0]]) == 0
+    with only_far():
+        assert main([*command, "--scheduler", scheduler[0]]) == 0
     assert_equal_results(folder, quick_run, "controller")
 
 
@@ -114,7 +124,8 @@ def test_the_command_line_runs_an_experiment_on_a_cluster(scheduler, tmp_path, m
     monkeypatch.setattr("stad_study.run.TRACKS", 3)
     command, episodes = ["replicate", "constant_driver", "--out"], []
     for name, where in (("far", ["--scheduler", scheduler[0]]), ("near", [])):
-        assert study.main([*command, str(tmp_path / name), *where]) == 0
+        with only_far() if where else nullcontext():
+            assert study.main([*command, str(tmp_path / name), *where]) == 0
         result = tmp_path / name / "constant_driver" / "seed0" / "evaluation.json"
         episodes.append(load_json(result)["episodes"])
     assert len(episodes[0]) == 3 and episodes[0] == episodes[1]
@@ -131,13 +142,15 @@ def test_the_command_line_runs_a_study_on_a_cluster(scheduler, tmp_path, monkeyp
         evaluate_kept, "__defaults__", (None, None, tmp_path / "networks", None, ())
     )
     name, far, episodes = "seed0/input_output/z_h", ["--scheduler", scheduler[0]], []
-    assert study.main(["replicate", "brief", "--out", str(tmp_path / "far"), *far]) == 0
+    with only_far():
+        assert study.main(["replicate", "brief", "--out", str(tmp_path / "far"), *far]) == 0
     assert study.main(["replicate", "brief", "--only", name, "--out", str(tmp_path / "near")]) == 0
     assert f"{name}: bit-identical to the recorded one, all 3 returns" in capsys.readouterr().out
     for where in (far, []):
         scores = tmp_path / f"{len(episodes)}.json"
         drive = ["evaluate", "brief", "--first-track", "7", "--episodes", "2"]
-        assert study.main([*drive, "--json", str(scores), *where]) == 0
+        with only_far() if where else nullcontext():
+            assert study.main([*drive, "--json", str(scores), *where]) == 0
         episodes.append(load_json(scores)["agents"][name]["episodes"])
     assert len(episodes[0]) == 2 and episodes[0] == episodes[1]
 

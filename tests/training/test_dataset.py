@@ -16,6 +16,7 @@ from stad_lab.cli import main
 from stad_lab.config import TRACK_RANGES, Config
 from stad_lab.envs.cars import Cars
 from stad_lab.envs.frames import difference_image, episode_differences
+from stad_lab.envs.state import true_motion
 from stad_lab.io.files import checksum, load_json, locked, save_json
 from stad_lab.training.dataset import (
     MANIFEST,
@@ -24,6 +25,7 @@ from stad_lab.training.dataset import (
     collect,
     drive_randomly,
     episode_file,
+    random_start,
 )
 
 QUICK = Config.preset("quick")
@@ -242,8 +244,9 @@ def test_random_starts_begin_on_the_road_and_not_in_the_opening_zoom():
     for index in range(2):
         dark = []  # share of black pixels in the first frame: the zoom shows what is outside
         for share in (0.0, 1.0):
-            data = {"random_starts": share, "episode_frames": 25}
-            dark.append((drive_randomly(QUICK.replace(data=data), index)[0][0] == 0).mean())
+            cars, _ = random_start(QUICK.replace(data={"random_starts": share}), index)
+            dark.append((cars.draw()[0] == 0).mean())
+            assert abs(true_motion(cars)[4]) < 1  # offset in half road widths
         assert dark[0] > 0.2 > dark[1]
 
 

@@ -481,7 +481,7 @@ def test_a_log_of_another_configuration_is_refused_and_stays_as_it_was(
 def test_a_deleted_controller_is_written_again_without_driving(uninterrupted, tmp_path):
     folder = shutil.copytree(uninterrupted, tmp_path / "run")
     (folder / C).unlink()
-    evolve(config(), folder)
+    evolve(config(), folder, object())  # an executor that drives nothing
     assert_equal_evolutions(folder, uninterrupted)
 
 
