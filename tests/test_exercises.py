@@ -133,9 +133,10 @@ def test_the_marks_count_the_machine_s_points_half_and_a_person_s_in_full(
     assert not printed.err
 
 
+@pytest.mark.parametrize("kind", ["manual_score", "extra_credit"])
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
 def test_points_by_hand_where_the_machine_grades_are_counted_and_warned_of(
-    graded, monkeypatch, capsys
+    graded, kind, monkeypatch, capsys
 ):
     root, name = graded
     cells = [grading(cell) for cell in read_cells(SOURCES[name])]
@@ -144,10 +145,10 @@ def test_points_by_hand_where_the_machine_grades_are_counted_and_warned_of(
     monkeypatch.setattr("sys.argv", ["marks.py", name])
     with open_gradebook(root) as gradebook:
         grade = gradebook.find_grade(by_machine, name, name, "stub")
-        grade.manual_score = 3.0
+        setattr(grade, kind, 3.0)
         gradebook.db.commit()
         runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
-        grade.manual_score = None
+        setattr(grade, kind, None)
         gradebook.db.commit()
     printed = capsys.readouterr()
     assert float(printed.out.splitlines()[-1].split(",")[2]) >= 3
@@ -155,7 +156,7 @@ def test_points_by_hand_where_the_machine_grades_are_counted_and_warned_of(
 
 
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
-def test_the_marks_of_an_unknown_assignment_end_in_one_line(graded, tmp_path, monkeypatch):
+def test_the_marks_of_an_unknown_assignment_end_in_one_line(graded, tmp_path, monkeypatch, capsys):
     root, name = graded
     unknown = f"no assignment '01' in gradebook.db: choose one of {name}"
     for folder, asked, told in (
@@ -166,7 +167,7 @@ def test_the_marks_of_an_unknown_assignment_end_in_one_line(graded, tmp_path, mo
         monkeypatch.setattr("sys.argv", ["marks.py", asked])
         with pytest.raises(SystemExit, match=told):
             runpy.run_path(str(COURSE / "marks.py"), run_name="__main__")
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.iterdir()) and not capsys.readouterr().out
 
 
 @pytest.mark.parametrize("graded", GRADED, indirect=True)
