@@ -102,11 +102,11 @@ def gains(claims: dict) -> str:
         told.append(f"{name_verdict(one)} ({round(one['difference'])} points)")
     both, alone = told
     if out_of_reach(study, "z, h"):
-        both += "; `frame` plus the paper's gain would exceed our best runs"
+        both += "; agents without it plus the paper's gain would exceed our best runs"
     return (
         "Does it help to see and reconstruct what has moved? A paper says so. We trained agents"
         " with and without it twelve times each. If the driver also sees the memory of earlier"
-        f" frames, as in World Models: {both}. If not: {alone}."
+        f" frames, as in World Models: {both}. Without that memory: {alone}."
     )
 
 

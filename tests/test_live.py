@@ -296,9 +296,11 @@ def test_a_page_whose_script_does_not_arrive_says_so(browser, live_pages, tmp_pa
     folder = shutil.copytree(live_pages, tmp_path / "live", copy_function=os.link)
     (folder / "js" / "frames.js").unlink()
     page = browser.new_page()
+    page.set_default_timeout(SLOW)
     page.goto((folder / "dream.html").as_uri())
     page.wait_for_selector("#live[data-state=failed]")
     assert page.inner_text("#message") == "A script did not arrive. Please reload the page."
+    page.close()
 
 
 READY = """async () => {

@@ -70,7 +70,7 @@ def test_where_the_best_pipelines_do_not_reach_the_gain_of_the_paper_the_page_sa
     told = describe_verdict(study)[-1]
     assert "With z and h `frame` plus such gains would exceed our best runs" in told
     assert "it has 855 points, 75 more are 930" in told
-    assert "on each track has 922 on average" in told and "With z such" not in told
+    assert "on each track has 922 on average" in told and "With z `frame`" not in told
     assert "With z and h `frame` plus 75 would exceed our" in blocks.finding({"study1": study})
     study["ceiling"] = 931.0
     assert "exceed our" not in describe_verdict(study)[-1]
