@@ -58,15 +58,21 @@ def result_file(file: Path | None, source: str, kind: str, details: str = "") ->
 
     Raises an OSError or ValueError, before any work, if it cannot or must not be written.
     """
-    from stad_lab.agent import PRETRAINED, run_folder
+    from stad_lab.agent import run_folder
     from stad_lab.evaluation.evaluate import check_output
 
     run = run_folder(source)
     name = f"{kind}-{run.resolve().name}{details}.json"
-    shipped = run.resolve().parent == PRETRAINED.resolve()
-    file = file or (Path(name) if shipped else run / name)
+    file = file or (Path(name) if is_shipped(run) else run / name)
     check_output(file, kind)
     return file
+
+
+def is_shipped(run: Path) -> bool:
+    """Whether a folder is that of a shipped agent, in the package: no result goes there."""
+    from stad_lab.agent import PRETRAINED
+
+    return run.resolve().parent == PRETRAINED.resolve()
 
 
 def training_command(config: Config) -> Callable:
@@ -236,15 +242,15 @@ def report(run: str, out: Path | None = None) -> None:
         run: A shipped agent, or the folder of a run.
         out: The .html to write; by default report.html in the run, or here for a shipped agent.
     """
-    from stad_lab.agent import PRETRAINED, run_folder
+    from stad_lab.agent import run_folder
     from stad_lab.io.files import check_writable, write_bytes
     from stad_lab.training.record import read_record
     from stad_lab.viz.report import report
 
     folder = run_folder(run)
     read_record(folder)
-    shipped, name = folder.resolve().parent == PRETRAINED.resolve(), folder.resolve().name
-    file = out or (Path(f"report-{name}.html") if shipped else folder / "report.html")
+    here = Path(f"report-{folder.resolve().name}.html")
+    file = out or (here if is_shipped(folder) else folder / "report.html")
     if file.suffix.lower() != ".html":
         raise ValueError(f"--out {file}: expected a .html")
     check_writable(file)

@@ -35,8 +35,8 @@ def describe_study4(folder: Path = tables.DATA) -> dict:
             "scores": own.sort_index()["mean"].tolist(),
         }
     found["shipped"] = shipped[[str(track) for track in TRACKS]].mean(axis=1).to_dict()
-    chosen = [one["mean"] for one in found["agents"].values()]
-    found["replaced"] = bool(np.mean(chosen) > np.mean(list(found["shipped"].values())))
+    means = [one["mean"] for one in found["agents"].values()]
+    found["replaced"] = bool(np.mean(means) > np.mean(list(found["shipped"].values())))
     return found
 
 

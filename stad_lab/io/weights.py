@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from stad_lab.config import RANGES, Config
+from stad_lab.config import RANGES, Config, check_same
 from stad_lab.io.files import checksum_of_tensors, load_into, load_tensors, save_tensors
 from stad_lab.models.controller import check_parameters
 from stad_lab.models.mdn_rnn import MDNRNN
@@ -109,6 +109,13 @@ def load_kind(path: Path, kind: str, *required: str) -> tuple[dict[str, torch.Te
         raise ValueError(f"{path} holds {metadata.get('kind')!r}: expected a file of {kind!r}")
     if missing := [name for name in required if name not in metadata]:
         raise ValueError(f"{path} is not a file of this kind: it lacks {missing[0]!r}; {REMEDY}")
+    return tensors, metadata
+
+
+def load_training(path: Path, made_with: dict) -> tuple[dict[str, torch.Tensor], dict]:
+    """Read a half-trained V or M; ValueError if damaged, or made with something else."""
+    tensors, metadata = load_tensors(path, "run the same command again to train from the start")
+    check_same(path, metadata.get("made_with", {}), made_with)
     return tensors, metadata
 
 

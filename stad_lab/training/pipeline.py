@@ -19,10 +19,16 @@ from pathlib import Path
 
 import torch
 
-from stad_lab.config import Config, check_same
+from stad_lab.config import Config
 from stad_lab.inference import Inference
-from stad_lab.io.files import load_json, load_tensors, locked, save_json
-from stad_lab.io.weights import CONTROLLER_FILE, MDN_RNN_FILE, VAE_FILE, load_world_model
+from stad_lab.io.files import load_json, locked, save_json
+from stad_lab.io.weights import (
+    CONTROLLER_FILE,
+    MDN_RNN_FILE,
+    VAE_FILE,
+    load_training,
+    load_world_model,
+)
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
 from stad_lab.training import second_iteration
@@ -156,9 +162,7 @@ def check_stages(config: Config, folder: Path, data: Path) -> None:
         (MDN_RNN_FILE, MDN_RNN_TRAINING, mdn_rnn_depends_on(config)),
     ):
         if not (folder / weights).exists() and (folder / training).exists():
-            remedy = "run the same command again to train from the start"
-            was = load_tensors(folder / training, remedy)[1].get("made_with", {})
-            check_same(folder / training, was, depends_on)
+            load_training(folder / training, depends_on)
     if (folder / VAE_FILE).exists():
         seen = check_vae(config, folder)["dataset"]
         check_seen(folder / VAE_FILE, seen, data)

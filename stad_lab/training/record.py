@@ -58,8 +58,8 @@ def read_finished(earlier: Path) -> dict:
     record = read_record(earlier)
     log = load_json(earlier / LOG, GIVE_A_RUN, kind="evolution")
     done, asked = len(log["generations"]), log["evolution"]["generations"]
-    driven = sum(len(one["returns"]) for one in log["generations"])
-    if done != asked or record.get("budget", {}).get("agents") != driven:
+    counted = record.get("budget", {}).get("agents")
+    if done != asked or counted != count_agents(log["generations"]):
         found = f"with {done} of {asked} generations: run its own command to the end first"
         raise ValueError(f"the run in {earlier} is not finished, {found}")
     return record
@@ -209,7 +209,7 @@ def budget(config: Config, folder: Path, data: Path | None) -> dict:
         spent[driver].update(episodes=1, frames=entry["frames"])
     if (folder / LOG).exists():
         generations = load_json(folder / LOG, kind="evolution")["generations"]
-        spent["agents"] = sum(len(entry["returns"]) for entry in generations)
+        spent["agents"] = count_agents(generations)
         for entry in generations:
             episodes = sum(map(len, entry["returns"]))
             spent["evolution"].update(episodes=episodes, frames=entry["frames"])
@@ -217,6 +217,11 @@ def budget(config: Config, folder: Path, data: Path | None) -> dict:
                 episodes = len(validation["returns"])
                 spent["validation"].update(episodes=episodes, frames=validation["frames"])
     return dict(spent)
+
+
+def count_agents(generations: list[dict]) -> int:
+    """How many candidates drove in some generations of CMA-ES."""
+    return sum(len(entry["returns"]) for entry in generations)
 
 
 def total_budget(record: dict) -> dict[str, int]:

@@ -61,8 +61,9 @@ def save_start(
     path: Path, parameters: np.ndarray, variant: str, world_model: WorldModel, **made_with: str
 ) -> None:
     """Write the C, float64 (parameters,), that a second iteration or fine-tuning starts from."""
-    tensors, metadata = {"parameters": torch.from_numpy(parameters)}, {"variant": variant}
-    save_tensors(path, tensors, kind="start", **metadata, **made_with, **world_model.checksums)
+    tensors = {"parameters": torch.from_numpy(parameters)}
+    made_with = {"variant": variant, **made_with, **world_model.checksums}
+    save_tensors(path, tensors, kind="start", **made_with)
 
 
 def load_start(path: Path, world_model: WorldModel) -> np.ndarray:

@@ -21,9 +21,10 @@ from torch import nn
 from torch.optim import Adam
 from tqdm.auto import tqdm
 
-from stad_lab.config import check_same, random_stream
-from stad_lab.io.files import load_into, load_tensors, save_tensors
+from stad_lab.config import random_stream
+from stad_lab.io.files import load_into, save_tensors
 from stad_lab.io.memory import keep_freed_memory, return_freed_memory
+from stad_lab.io.weights import load_training
 from stad_lab.io.workers import interrupted_at_the_end
 
 ENTRIES = 20  # of the history, and checkpoints, at least, in a training
@@ -177,8 +178,7 @@ def save_state(training: Training, optimizer: Adam, history: list) -> None:
 def load_state(training: Training, optimizer: Adam) -> list[dict]:
     """Restore what `save_state` wrote into the model and the optimizer; returns the history."""
     path = training.checkpoint
-    tensors, metadata = load_tensors(path, "run the same command again to train from the start")
-    check_same(path, metadata.get("made_with", {}), training.made_with)
+    tensors, metadata = load_training(path, training.made_with)
     weights = {name[6:]: value for name, value in tensors.items() if name.startswith("model.")}
     load_into(training.model, weights, path)
     state, parameters = optimizer.state_dict(), list(training.model.parameters())
