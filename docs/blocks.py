@@ -40,6 +40,7 @@ from stad_study.verdict import (
     PAPER_GAIN,
     describe_cause,
     describe_ceiling,
+    describe_changes,
     describe_others,
     describe_repetition,
     describe_verdict,
@@ -87,10 +88,10 @@ def finding(claims: dict) -> str:
 
 
 def verdict(claims: dict) -> str:
-    """The verdict of study 1, point by point; and once it is known, that of part 5a."""
-    told = describe_verdict(claims["study1"])
-    if repeated := claims["study5"]["comparisons"]:
-        told[2] += " " + describe_repetition(repeated["interaction"])
+    """The verdict of study 1, point by point, and what study 5 adds to it."""
+    told, repeated = describe_verdict(claims["study1"]), claims["study5"]["comparisons"]
+    told[2] += " " + describe_repetition(repeated["interaction"])
+    told.insert(3, describe_changes(repeated))
     return "\n".join(f"- {sentence}" for sentence in told)
 
 
@@ -137,17 +138,11 @@ def afterwards(claims: dict) -> str:
 
 
 def cause(claims: dict) -> str:
-    """Study 5: how many runs are done, and of complete parts the tests, figure and meaning."""
+    """Study 5: its meaning, figures and tables."""
     study = claims["study5"]
-    counts = (f"{part} {runs} of {study['planned'][part]}" for part, runs in study["runs"].items())
-    parts = [f"Runs done: {', '.join(counts)}."]
-    if study["comparisons"]:
-        meaning = "**" + " ".join(describe_cause(study)) + "**"
-        tables = [cause_table(study), repeated_table(study, claims["study1"])]
-        parts = [meaning, image("study5", claims), *tables, *parts]
-        if "study5_curves" in drawable(claims):
-            parts += [changed_table(study), image("study5_curves", claims)]
-    return "\n\n".join(parts)
+    meaning = "**" + " ".join(describe_cause(study)) + "**"
+    tables = [cause_table(study), repeated_table(study, claims["study1"]), changed_table(study)]
+    return "\n\n".join([meaning, image("study5", claims), *tables, image("study5_curves", claims)])
 
 
 def cause_table(study: dict) -> str:
@@ -304,13 +299,6 @@ FIGURES: dict[str, Callable] = {  # name of the file -> what draws it from claim
         claims["study5"]["arms"], config.PRESETS["laptop"].evolution.validate_every
     ),
 }
-
-
-def drawable(claims: dict) -> set[str]:
-    """The names of FIGURES whose data there are: those of study 5 wait for its parts."""
-    comparisons = claims["study5"]["comparisons"]
-    ready = {"study5": bool(comparisons), "study5_curves": "adding motion" in comparisons}
-    return {name for name in FIGURES if ready.get(name, True)}
 
 
 def image(name: str, claims: dict) -> str:

@@ -12,7 +12,7 @@ import re
 import sys
 from pathlib import Path
 
-from blocks import BLOCKS, FIGURES, NUMBERS, drawable, front_matter
+from blocks import BLOCKS, FIGURES, NUMBERS, front_matter
 from gallery import PICTURES
 
 from stad_lab.viz.plots import to_png
@@ -75,7 +75,7 @@ def main() -> int:
         if not check:
             file.write_text(text, encoding="utf-8")
     if not check:
-        for name in sorted(drawable(claims)):
+        for name in FIGURES:
             (PICTURES / f"{name}.png").write_bytes(to_png(FIGURES[name](claims)))
     return int(check and bool(found))
 

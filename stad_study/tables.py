@@ -96,7 +96,7 @@ def line_of(name: str, key: Sequence, folder: Path = DATA) -> dict | None:
 
 
 def returns_of_runs(study: str, tracks: Sequence[int], folder: Path = DATA) -> pandas.DataFrame:
-    """The returns of study 2 or 4: a line for each of its runs, a column for each track.
+    """The returns of study 2, 4 or 5: a line for each of its runs, a column for each track.
 
     ValueError if a run has no return on one of the tracks.
     """

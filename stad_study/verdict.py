@@ -7,7 +7,6 @@ from stad_study.claims import PAPER_GAINS
 from stad_study.study_claims import LEVEL, MARGIN
 
 PAPER_GAIN = PAPER_GAINS["input_output"]
-TESTED = {"interaction", "input_output less input", "adding motion", "erasing motion"}  # study 5
 SEES = {
     "z, h": "z and h, as in World Models",  # the claim
     "z": "z alone",  # a diagnostic
@@ -55,6 +54,14 @@ def describe_repetition(one: dict) -> str:
     text = "[Study 5a](#is-it-the-motion), planned later, with three new controllers for each of"
     text += f" the same V and M: {one['difference']:.1f} points"
     return f"{text} ({low:.1f} to {high:.1f}; Holm's p = {one['holm_p']:.3f})."
+
+
+def describe_changes(comparisons: dict[str, dict]) -> str:
+    """What adding and erasing the motion did in parts 5b and 5c of study 5."""
+    adding, erasing = (comparisons[name] for name in ("adding motion", "erasing motion"))
+    text = f"Why? The motion, added to z of `frame`: *{adding['verdict']}*"
+    text += f" ({adding['difference']:+.1f} points). Erased from z of `input_output`:"
+    return f"{text} *{erasing['verdict']}* ({erasing['difference']:+.1f})."
 
 
 def describe_ceiling(study: dict) -> str:
@@ -106,18 +113,13 @@ def describe_paper_gain(study: dict) -> str:
 
 
 def describe_cause(study: dict) -> list[str]:
-    """What the comparisons of study 5 mean: of 5a, and of 5b and 5c, where they are complete.
+    """What study 5 means: its part 5a, and all parts together.
 
     Args:
         study: what `describe_study5` returns.
     """
     comparisons = study["comparisons"]
-    told = []
-    if "interaction" in comparisons:
-        told.append(read_repetition(comparisons["interaction"]["verdict"]))
-    if set(comparisons) >= TESTED:
-        told.append(read_cause(comparisons))
-    return told
+    return [read_repetition(comparisons["interaction"]["verdict"]), read_cause(comparisons)]
 
 
 def read_repetition(verdict: str) -> str:

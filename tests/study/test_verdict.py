@@ -8,7 +8,7 @@ import pytest
 
 from stad_study.claims import read_claims
 from stad_study.study_claims import FEATURES, find_verdict
-from stad_study.verdict import describe_cause, describe_others, describe_verdict
+from stad_study.verdict import describe_cause, describe_changes, describe_others, describe_verdict
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
 import blocks
@@ -127,20 +127,16 @@ def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_f
         ([-60.0, 9.0], ": -25.5 points (-60.0 to 9.0;"),
     ],
 )
-def test_whether_the_two_effects_differ_is_told_from_study_5_once_it_is_known(interval, words):
-    study = study_with(("no relevant gain", "gain"))
-    claims = {"study1": study, "study5": {"comparisons": {}}}
-    assert "p = 0.075" in blocks.verdict(claims) and words not in blocks.verdict(claims)
+def test_whether_the_two_effects_differ_is_told_from_both_studies(interval, words):
+    claims = {"study1": study_with(("no relevant gain", "gain"))}
     claims["study5"] = cause_with({"interaction": interval})
     assert words in blocks.verdict(claims) and "p = 0.075" in blocks.verdict(claims)
 
 
-def test_part_5a_alone_is_read_without_saying_what_explains_the_gain():
-    study = cause_with()
-    kept = ("interaction", "input_output less input")
-    study["comparisons"] = {name: study["comparisons"][name] for name in kept}
-    (told,) = describe_cause(study)
-    assert "explains" not in told
+def test_what_adding_and_erasing_the_motion_did_is_told_with_its_verdicts():
+    told = describe_changes(cause_with({"erasing motion": [-40.0, 5.0]})["comparisons"])
+    assert "`frame`: *gain* (+29.5 points)" in told
+    assert "`input_output`: *undecided* (-17.5)" in told
 
 
 @pytest.mark.parametrize(
