@@ -163,6 +163,9 @@ def run_one(
     folder, kept = root / run.name, networks / study.name / run.name
     if (folder / SCORE).exists():
         return
+    made_with = provenance(
+        f"python -m stad_study replicate {study.name} --only {run.name} --out ..."
+    )
     begin, keeps = time.perf_counter(), study.keeps_logs and not repeat
     with fixed_threads():
         sense = study.prepare(run, root, networks)
@@ -179,9 +182,6 @@ def run_one(
         controller = resume(run.config, folder, sense, log).controller().astype(np.float16)
         score = score_controller(sense, controller)
     seconds = time.perf_counter() - begin
-    made_with = provenance(
-        f"python -m stad_study replicate {study.name} --only {run.name} --out ..."
-    )
     save_json(
         folder / SCORE, {"kind": "score", "made_with": made_with, **score, "seconds": seconds}
     )
