@@ -20,7 +20,10 @@ HERE = Path(__file__).parent
 ENGINE, FACTS = HERE / "engine" / "engine.wasm", HERE / "engine" / "engine.json"
 TABLES = HERE / "engine" / "tables.bin"
 LIBRARY = HERE.parents[1] / "stad_lab"
-SOURCES = ("envs/physics.py", "envs/picture.py", "envs/track.py", "envs/frames.py", "inference.py")
+SOURCES = (
+    "envs/cars.py", "envs/compiling.py", "envs/frames.py", "envs/physics.py", "envs/picture.py",
+    "envs/track.py", "inference.py",
+)  # fmt: skip
 FEATURES = "+bulk-memory,+nontrapping-fptoint,+sign-ext,+simd128"
 STACK = 1 << 20  # bytes
 
