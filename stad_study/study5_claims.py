@@ -101,7 +101,7 @@ def compare(scores: dict[str, np.ndarray], comparisons: Comparisons) -> dict[str
     found = {}
     for name, sides in comparisons.items():
         added, subtracted = (
-            sum(weight * scores[arm] for arm, weight in side.items()) for side in sides
+            np.sum([weight * scores[arm] for arm, weight in side.items()], axis=0) for side in sides
         )
         found[name] = compare_arms(subtracted, added)
     return found

@@ -54,7 +54,7 @@ def fine_tune(
     """Continue CMA-ES from the C of the run in `earlier`; False if everything was finished already.
 
     `folder` becomes a run of its own, with copies of V and M and with the earlier run's record.
-    `config` is made by `fine_tuning_config`; `executor` is as for `evolve`.
+    `config` is such as `fine_tuning_config` makes; `executor` is as for `evolve`.
 
     Raises:
         ValueError: a setting outside OPEN is not the earlier run's, that run is damaged or not

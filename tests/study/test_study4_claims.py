@@ -8,7 +8,8 @@ import pytest
 
 from stad_lab.config import VARIANTS
 from stad_study import tables
-from stad_study.study4 import TRACKS, find_runs
+from stad_study.study import STUDIES
+from stad_study.study4 import SEEDS, TRACKS, VALIDATION, find_runs
 from stad_study.study4_claims import describe_study4
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
@@ -81,3 +82,8 @@ def test_a_run_without_all_its_returns_is_refused(tmp_path):
     tables.save("study4_returns", table.iloc[:-1], tmp_path)
     with pytest.raises(ValueError, match="study4_returns: expected a return of each run"):
         describe_study4(tmp_path)
+
+
+def test_study_4_has_the_seeds_tracks_and_limits_of_the_protocol():
+    assert [*SEEDS] == [400, 401, 402] and VALIDATION == 64
+    assert [*TRACKS] == [*range(6000, 6400)] and STUDIES["study1"].max_frames == 1000
