@@ -59,9 +59,10 @@ def describe_repetition(one: dict) -> str:
 def describe_changes(comparisons: dict[str, dict]) -> str:
     """What adding and erasing the motion did in parts 5b and 5c of study 5."""
     adding, erasing = (comparisons[name] for name in ("adding motion", "erasing motion"))
-    text = f"Why? The motion, added to z of `frame`: *{adding['verdict']}*"
-    text += f" ({adding['difference']:+.1f} points). Erased from z of `input_output`:"
-    return f"{text} *{erasing['verdict']}* ({erasing['difference']:+.1f})."
+    low, high = adding["interval"]
+    text = f"Why? Motion added to z of `frame`, against a placebo: *{adding['verdict']}*"
+    text += f" ({adding['difference']:+.1f}, {low:.1f} to {high:.1f}). Erased from z of"
+    return f"{text} `input_output`: *{erasing['verdict']}* ({erasing['difference']:+.1f})."
 
 
 def describe_ceiling(study: dict) -> str:
@@ -154,7 +155,8 @@ def read_cause(comparisons: dict[str, dict]) -> str:
         )
     missing = "; ".join(name for name, found in holds.items() if not found)
     shown = "; ".join(name for name, found in holds.items() if found) or "nothing"
-    return f"That the motion explains the gain is not shown. Shown: {shown}. Not shown: {missing}."
+    text = f"That the motion explains the gain is not shown. Conditions that hold: {shown}."
+    return f"{text} That do not: {missing}."
 
 
 def opposite(verdict: str, other: str) -> str:

@@ -109,7 +109,7 @@ def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_f
         ),
     ):
         reading = describe_cause(cause_with({name: [-31.0, 29.0]}))[-1]
-        shown, _, not_shown = reading.partition("Not shown: ")
+        shown, _, not_shown = reading.partition("That do not: ")
         assert "is not shown" in shown and missing not in shown and not_shown == f"{missing}."
     reading = describe_cause(cause_with({"adding motion": [-60.0, -5.0]}))[-1]
     assert "adding the motion is a gain (it is a harm)" in reading
@@ -117,7 +117,7 @@ def test_the_motion_explains_the_gain_only_if_all_holds_that_the_protocol_asks_f
     assert "erasing the motion is a harm (it is a gain)" in reading
     names = ("interaction", "adding motion", "erasing motion", "both with motion")
     reading = describe_cause(cause_with({name: [-40.0, 40.0] for name in names}))[-1]
-    assert "Shown: nothing." in reading
+    assert "Conditions that hold: nothing." in reading
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_whether_the_two_effects_differ_is_told_from_both_studies(interval, word
 
 def test_what_adding_and_erasing_the_motion_did_is_told_with_its_verdicts():
     told = describe_changes(cause_with({"erasing motion": [-40.0, 5.0]})["comparisons"])
-    assert "`frame`: *gain* (+29.5 points)" in told
+    assert "`frame`, against a placebo: *gain* (+29.5, 9.0 to 50.0)" in told
     assert "`input_output`: *undecided* (-17.5)" in told
 
 
