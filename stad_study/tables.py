@@ -98,15 +98,19 @@ def line_of(name: str, key: Sequence, folder: Path = DATA) -> dict | None:
 def returns_of_runs(study: str, tracks: Sequence[int], folder: Path = DATA) -> pandas.DataFrame:
     """The returns of study 2, 4 or 5: a line for each of its runs, a column for each track.
 
-    ValueError if a run has no return on one of the tracks.
+    ValueError if a run has no return on one of the tracks, or another mean in the table of runs.
     """
     keys = TABLES[f"{study}_runs"][0]
     runs, table = (read_or_empty(f"{study}_{part}", folder) for part in ("runs", "returns"))
-    wanted = {"index": runs.set_index(keys).index, "columns": [str(track) for track in tracks]}
+    runs = runs.set_index(keys)
+    wanted = {"index": runs.index, "columns": [str(track) for track in tracks]}
     table = table.set_index(keys).reindex(**wanted)
     if table.isna().any(axis=None):
         where = f"the tracks {tracks[0]} to {tracks[-1]}"
         raise ValueError(f"{study}_returns: expected a return of each run on {where}")
+    apart = (table.mean(axis=1) - runs["mean"]).abs() > 0.01  # returns are kept to a cent
+    if apart.any():
+        raise ValueError(f"{study}: mean and returns differ: {apart[apart].index.tolist()}")
     return table
 
 

@@ -25,6 +25,7 @@ def write_tables(folder, scores):
     rng, lines = np.random.default_rng(0), []
     for run, score in scores.items():
         returns = score + rng.normal(0, 1, 400)
+        returns += score - returns.mean()
         columns = {str(1000 + track): one for track, one in enumerate(returns)}
         made = {"mean": score, "processor": "a CPU", "controller": "c"}
         lines.append(run._asdict() | columns | made)
