@@ -126,6 +126,7 @@ def fine_tune(
     generations: int | None = None,
     sigma: float | None = None,
     seed: int | None = None,
+    validation_tracks: int | None = None,
     processes: int = 2,
     scheduler: str | None = None,
 ) -> None:
@@ -139,6 +140,7 @@ def fine_tune(
         generations: Generations of CMA-ES, a multiple of 5; 15 if not given.
         sigma: Initial step size; 0.02 if not given.
         seed: Seed of the candidates and tracks; the run's own if not given.
+        validation_tracks: Tracks of a validation; as many as in the run if not given.
         processes: Workers that drive.
         scheduler: Address of a Dask scheduler, to drive on a cluster.
     """
@@ -146,6 +148,7 @@ def fine_tune(
     from stad_lab.training.fine_tuning import fine_tune, fine_tuning_config
 
     asked = {"generations": generations, "sigma": sigma, "seed": seed}
+    asked["validation_tracks"] = validation_tracks
     changes = {name: value for name, value in asked.items() if value is not None}
     earlier, folder = run_folder(run), output(out)
     config = fine_tuning_config(earlier, evolution=changes, processes=processes)

@@ -29,8 +29,9 @@ from stad_lab.io.weights import (
 from stad_lab.io.workers import TaskError
 from stad_lab.models.mdn_rnn import MDNRNN
 from stad_lab.models.vae import VAE
+from stad_lab.training.fine_tuning import fine_tuning_config
 from stad_lab.training.pipeline import STAGES
-from stad_lab.training.record import command_of
+from stad_lab.training.record import command_of, fine_tuning_command
 from stad_study import cli as study
 
 QUICK = Config.preset("quick")
@@ -238,13 +239,27 @@ def test_the_options_of_fine_tune_reach_it(monkeypatch, quick_run):
     monkeypatch.setattr(
         "stad_lab.training.fine_tuning.fine_tune", lambda *given: told.append(given)
     )
-    options = "--generations 5 --sigma .01 --seed 3 --processes 1 --out runs/tuned"
-    assert call("fine-tune", "--run", quick_run, *options.split()) == 0
+    options = "--generations 5 --sigma .01 --seed 3 --validation-tracks 9"
+    others = "--processes 1 --out runs/tuned"
+    assert call("fine-tune", "--run", quick_run, *options.split(), *others.split()) == 0
     ((config, earlier, folder, executor),) = told
     evolution = config.evolution
     assert (evolution.generations, evolution.sigma, evolution.seed) == (5, 0.01, 3)
+    assert evolution.validation_tracks == 9
     assert (config.processes, earlier, folder) == (1, quick_run, Path("runs/tuned"))
     assert executor is None
+
+
+def test_the_recorded_command_of_a_fine_tuning_makes_the_same_one(monkeypatch, quick_run):
+    told = []
+    monkeypatch.setattr(
+        "stad_lab.training.fine_tuning.fine_tune", lambda *given: told.append(given)
+    )
+    own = {"generations": 10, "sigma": 0.03, "seed": 4, "validation_tracks": 12}
+    config = fine_tuning_config(quick_run, evolution=own)
+    command = fine_tuning_command(config).replace("--run ...", f"--run {quick_run}")
+    assert call(*command.replace("...", "runs/tuned").split()[3:]) == 0
+    assert told[0][0] == config
 
 
 def test_a_film_is_a_moving_picture(quick_run, tmp_path, capsys):

@@ -10,11 +10,12 @@ from concurrent.futures import Executor
 from pathlib import Path
 
 import numpy as np
+import torch
 from threadpoolctl import threadpool_limits
 
 from stad_lab.config import Config
 from stad_lab.evaluation.evaluate import evaluations_of, is_of_agent
-from stad_lab.io.files import load_json
+from stad_lab.io.files import load_json, load_tensors
 from stad_lab.io.weights import (
     CONTROLLER_FILE,
     MDN_RNN_FILE,
@@ -103,7 +104,7 @@ def other_machine(made_with: dict, here: dict) -> str:
     names = (*MACHINE, *PACKAGES)
     found = [
         f"{name} is {here[name]!r} and was {made_with[name]!r}"
-        for name in names
+        for name in (*names, "blas")  # which older records lack
         if name in made_with and here[name] != made_with[name]
     ]
     if unknown := [name for name in names if name not in made_with]:
@@ -186,6 +187,12 @@ def verify_evaluations(folder: Path) -> str:
     return f"ok: {', '.join(file.name for file in files)}" if files else "none: not evaluated here"
 
 
+def in_half(folder: Path) -> bool:
+    """Whether V is kept in half precision, as an agent is shipped."""
+    tensors, _ = load_tensors(folder / VAE_FILE)
+    return any(tensor.dtype == torch.float16 for tensor in tensors.values())
+
+
 def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
     """Drive recorded episodes again: of an evaluation, or of the validation that chose C."""
     parameters, _ = load_controller(folder / CONTROLLER_FILE)
@@ -205,6 +212,8 @@ def drive_again(folder: Path, config: Config, executor: Executor | None) -> str:
             tasks = [(source, parameters, track, not official) for track in tracks]
             found = run_in_order(executor, evolution.drive_group, tasks)
             driven = [float(returns[0]) for returns, _ in found]
+        elif in_half(folder):  # the validations were driven in full precision
+            return "none: V and M are in half precision: evaluate the agent first"
         else:  # `validate` drives all of its tracks
             _, log = logged(folder, config)
             kept = evolution.kept_generation(folder, log)

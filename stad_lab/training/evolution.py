@@ -231,7 +231,7 @@ def replay(
         if check and crc(strategy.mean) != entry["mean_checksum"]:
             raise ValueError(
                 f"replaying the log gives another mean in generation {number + 1}: the log was"
-                " changed, or is of another machine or other versions. Start in a new folder"
+                " changed, or is of another machine or other versions. Move it and C away"
             )
     return strategy, means
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from threadpoolctl import threadpool_info
 
 from stad_lab.config import PRESETS, Config, check_same, fields_of
 from stad_lab.io.files import load_json, save_json
@@ -134,7 +135,7 @@ def command_of(config: Config) -> str:
 
 def fine_tuning_command(config: Config) -> str:
     """The command line that makes a fine-tuning of this configuration."""
-    names = ("generations", "sigma", "seed")
+    names = ("generations", "sigma", "seed", "validation_tracks")
     options = [option_of(name, getattr(config.evolution, name)) for name in names]
     return " ".join(["python -m stad_lab fine-tune --run ... --out ...", *options])
 
@@ -155,6 +156,7 @@ def provenance(command: str) -> dict:
         **{package: importlib.metadata.version(package) for package in PACKAGES},
         "platform": f"{platform.system()} {platform.machine()}",
         "processor": processor(),
+        "blas": blas(),
         "cores": os.cpu_count(),
         "threads": torch.get_num_threads(),  # the last bits of V and M depend on them
         "trained_on": describe_device(),
@@ -173,6 +175,16 @@ def processor() -> str:
     text = listed.read_text() if listed.exists() else ""
     name = text.partition("model name")[2].partition("\n")[0].strip("\t :")
     return f"{name or platform.processor()}, {torch.backends.cpu.get_cpu_capability()}"
+
+
+def blas() -> str:
+    """NumPy's library of matrix products, and the kind of processor that it computes for.
+
+    `OPENBLAS_CORETYPE` can choose another kind, and with it other last bits.
+    """
+    found = [one for one in threadpool_info() if one["user_api"] == "blas"]
+    parts = ("internal_api", "version", "architecture")
+    return "; ".join(sorted({" ".join(str(one.get(part)) for part in parts) for one in found}))
 
 
 def describe_device() -> str:

@@ -1,6 +1,10 @@
 """Verify: a file that was edited, and given a right checksum again, is found."""
 
+import os
+import platform
 import shutil
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,6 +14,7 @@ from stad_lab.agent import load_agent
 from stad_lab.evaluation.evaluate import KIND, describe_agent, report
 from stad_lab.evaluation.verify import verify
 from stad_lab.io.files import load_json, save_json
+from stad_study.ship import copy_in_half
 
 EVALUATION, LOG, RECORD = "evaluation-run.json", "evolution.json", "record.json"
 
@@ -45,6 +50,16 @@ def test_a_whole_run_has_no_failure(evaluated, check):
         "record", "dataset", "V", "M", "log of CMA-ES", "C", "evaluations", "episodes",
     }  # fmt: skip
     assert all(outcome.startswith("ok") for outcome in found.values())
+
+
+def test_an_agent_in_half_precision_is_not_measured_by_the_validations_of_its_run(
+    quick_run, tmp_path
+):
+    shutil.copytree(quick_run, tmp_path / "run")
+    copy_in_half(tmp_path / "run", tmp_path / "agent")
+    found = verify(tmp_path / "agent")
+    assert not any(outcome.startswith("FAILED") for outcome in found.values()), found
+    assert found["episodes"].startswith("none") and "evaluate the agent first" in found["episodes"]
 
 
 def worst_is_best(log):
@@ -85,3 +100,17 @@ def test_an_edited_file_fails(name, change, part, message, evaluated, check):
     assert found[part].startswith("FAILED") and message in found[part]
     others = [outcome for one, outcome in found.items() if one != part]
     assert name == LOG or all(outcome.startswith("ok") for outcome in others)
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="a kind of processor of x86_64")
+def test_a_record_names_the_kind_of_processor_that_blas_computes_for():
+    asked = "from stad_lab.training.record import blas; print(blas())"
+    for kind in ("Haswell", "Sandybridge"):
+        told = subprocess.run(
+            [sys.executable, "-c", asked],
+            env={**os.environ, "OPENBLAS_CORETYPE": kind},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert told.stdout.strip().endswith(kind)

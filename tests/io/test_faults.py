@@ -632,6 +632,8 @@ def test_verify_finds_a_return_that_no_episode_gives(quick_run, tmp_path, in_thi
         ({"numba": None}, 0.001, "differs: .*; unknown, because not recorded: numba$"),
         ({"numba": None}, 60, "FAILED"),
         ({"processor": "another"}, 29, "differs: .*; processor is '.*' and was 'another'$"),
+        ({"blas": "another"}, 29, "differs: .*; blas is '.*' and was 'another'$"),
+        ({"blas": None}, 0.001, "FAILED"),
         ({"processor": "another"}, 60, "FAILED.*: rounding alone does not explain it"),
     ],
 )

@@ -7,9 +7,12 @@ import pandas
 import pytest
 
 from stad_lab.config import VARIANTS
+from stad_lab.io.files import load_json
+from stad_lab.training.record import RECORD
 from stad_study import tables
+from stad_study.networks import NETWORKS
 from stad_study.study import STUDIES
-from stad_study.study4 import SEEDS, TRACKS, VALIDATION, find_runs
+from stad_study.study4 import SEEDS, TRACKS, VALIDATION, controller_of, find_runs
 from stad_study.study4_claims import describe_study4
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
@@ -87,3 +90,12 @@ def test_a_run_without_all_its_returns_is_refused(tmp_path):
 def test_study_4_has_the_seeds_tracks_and_limits_of_the_protocol():
     assert [*SEEDS] == [400, 401, 402] and VALIDATION == 64
     assert [*TRACKS] == [*range(6000, 6400)] and STUDIES["study1"].max_frames == 1000
+
+
+def test_of_each_variant_the_agent_with_the_best_validation_is_kept():
+    runs = tables.read("study4_runs")
+    for variant, own in runs.groupby("variant"):
+        best = own.loc[own["validation"].idxmax()]
+        assert controller_of(NETWORKS / "study4" / variant)["controller"] == best["controller"]
+        record = load_json(NETWORKS / "study4" / variant / RECORD)
+        assert (record["variant"], record["config"]["seed"]) == (variant, best["seed"])

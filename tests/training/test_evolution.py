@@ -456,7 +456,7 @@ def test_a_log_that_was_changed_is_refused(first_part, tmp_path):
     returns = log["generations"][0]["returns"]
     returns[int(np.argmin(returns))] = [1000.0]
     save_json(folder / LOG, log)
-    error = r"another mean in generation 1: the log was changed.*Start in a new folder"
+    error = r"another mean in generation 1: the log was changed.*Move it and C away"
     with pytest.raises(ValueError, match=error):
         evolve(config(), folder)
     assert load_json(folder / LOG) == log
