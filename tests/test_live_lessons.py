@@ -192,6 +192,20 @@ def test_a_generation_shows_its_path_its_points_and_its_dream(opened):
         page.wait_for_function(f"track.ariaLabel.includes('Generation {generation}:')")
 
 
+# No file of weights arrives.
+NEVER = "globalThis.stad = { set load(_) {}, get load() { return () => new Promise(() => {}) } }"
+
+
+def test_cma_es_in_two_dimensions_does_not_wait_for_the_networks(browser, live_pages):
+    page = browser.new_page()
+    page.add_init_script(NEVER)
+    page.goto((live_pages / "evolution.html").as_uri())
+    page.click("#step")
+    assert "Generation 1" in page.inner_text("#state")
+    assert page.get_attribute("#live", "data-state") == "loading"
+    page.close()
+
+
 def test_cma_es_on_the_page_can_be_begun_stepped_by_keyboard(opened):
     page = opened("evolution")
     page.select_option("#landscape", "sphere")

@@ -35,6 +35,8 @@ GAMEPAD = """() => {
 def test_a_gamepad_begins_a_race_but_holding_it_does_not_end_a_pause(opened):
     page = opened("race", reduced_motion="reduce")
     page.evaluate(GAMEPAD)
+    page.evaluate("trigger.value = 0.05")  # a worn one, which nobody holds
+    assert stays(page, "attract")
     page.evaluate("trigger.value = 0.5")
     phase(page, "race")
     page.wait_for_function("stad.page.state.action[1] === 0.5")
@@ -68,7 +70,7 @@ def test_esc_gives_the_arrow_keys_to_the_page_and_a_text_field_has_its_letters(o
     page.evaluate("scrollTo(0, 0)")
     page.keyboard.press("Escape")
     phase(page, "paused")
-    assert "Click the picture" in page.inner_text("#card")
+    assert "Press P or click the picture" in page.inner_text("#card")
     page.keyboard.press("ArrowDown")
     page.keyboard.press("ArrowUp")
     page.keyboard.press("ArrowDown")
@@ -148,6 +150,33 @@ def test_no_race_begins_before_a_rival_that_loads_slowly_is_there(opened):
     page.keyboard.press("ArrowUp")
     phase(page, "race")
     page.wait_for_function("stad.page.state.you.frames > 10")
+
+
+def test_without_its_files_a_rival_is_not_raced_and_another_one_is(opened):
+    page = opened("race", reduced_motion="reduce")
+    phase(page, "attract")
+    page.evaluate("() => { stad.loads = stad.loadTensors }")
+    page.evaluate("() => { stad.loadTensors = async () => { throw new Error('lost') } }")
+    page.select_option("#agent", "input")
+    page.wait_for_function("document.querySelector('#card-way').textContent.includes('another')")
+    for start in ("#again", "#race"):
+        page.click(start)
+        assert stays(page, "attract")
+    page.evaluate("() => { stad.loadTensors = stad.loads }")
+    page.select_option("#agent", "output")
+    page.wait_for_function("!document.querySelector('#card-way').textContent.includes('another')")
+    page.click("#again")
+    phase(page, "race")
+
+
+def test_a_button_that_starts_a_race_brings_it_into_the_window(opened):
+    page = opened("race", viewport={"width": 844, "height": 390}, has_touch=True)
+    page.tap("#again")
+    phase(page, "race")
+    box = page.locator("#race").bounding_box()
+    shown = min(box["y"] + box["height"], 390) - max(box["y"], 0)
+    assert shown > 0.9 * box["height"]
+    page.wait_for_function("stad.page.state.you.pose.speed > 10")  # a finger gives gas by itself
 
 
 def test_the_easy_way_gives_no_gas_above_60_until_it_is_switched_off(opened):

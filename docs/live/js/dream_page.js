@@ -298,7 +298,7 @@ stad.start(async () => {
     if (dream && driver === "hand") setPlaying(false);
   });
   const take = touched(() => {
-    if (driver !== "hand" || !dream) setDriver("hand");
+    if (driver !== "hand" || !dream || !clock.running) setDriver("hand");
   });
   const drives = () =>
     dream && clock.running && (driver === "hand" || get("live").contains(document.activeElement));

@@ -1,5 +1,5 @@
 "use strict";
-// The page "Evolution", upper part: the generations of a real CMA-ES run, on the track and in M.
+// The page "A recorded evolution", upper part: a run of CMA-ES, on the track and in M.
 
 stad.start(async () => {
   const AGENT = "cropped_input"; // whose run it is

@@ -153,7 +153,8 @@ stad.start(async () => {
     const begun = log.length > 0 || driving !== null;
     get("run").textContent = driving && paused === null ? "Pause" : begun ? "Go on" : "Start";
     get("bet-value").textContent = bet ?? "?";
-    get("bet").value = bet ?? 1;
+    get("step").textContent = driving ? "Stop after this generation" : "One generation";
+    get("bet").value = bet ?? 0;
     get("bet").setAttribute("aria-valuetext", bet ?? "no bet yet");
     get("bet").disabled = begun;
     get("download").disabled = get("race").hidden = log.length === 0;
@@ -238,7 +239,7 @@ stad.start(async () => {
     get("restart").textContent = on ? "Start afresh all the same" : "Start afresh";
   }
   get("bet").addEventListener("input", ({ target }) => {
-    bet = Number(target.value);
+    bet = Number(target.value) || null;
     showButtons();
   });
   get("download").addEventListener("click", () =>

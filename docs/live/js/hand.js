@@ -6,8 +6,9 @@ globalThis.stad ??= {};
 stad.readGamepad = () => {
   for (const pad of navigator.getGamepads?.() ?? []) {
     if (!pad || pad.axes.length < 1) continue;
-    const steering = Math.abs(pad.axes[0]) < 0.1 ? 0 : pad.axes[0]; // a stick never rests at 0
-    const [gas, brake] = [7, 6].map((button) => pad.buttons[button]?.value ?? 0);
+    const asked = [pad.axes[0], pad.buttons[7]?.value ?? 0, pad.buttons[6]?.value ?? 0];
+    // A worn stick or trigger does not rest at 0.
+    const [steering, gas, brake] = asked.map((value) => (Math.abs(value) < 0.1 ? 0 : value));
     if (steering || gas || brake) return [steering, gas, brake];
   }
   return null;

@@ -1,8 +1,11 @@
 "use strict";
-// The page "Evolution", lower part: CMA-ES in two dimensions, step by step.
+// The page "A recorded evolution", lower part: CMA-ES in two dimensions, step by step.
 
 {
   const plane = stad.get("plane");
+  const figure = plane.closest(".figure"); // outside of `live`: it does not wait for the networks
+  stad.forget(figure);
+  stad.quieten(figure);
   const choices = ["landscape", "population", "sigma"].map(stad.get);
   const [landscapeBox, populationBox, sigmaBox] = choices;
   for (const [id, { name }] of Object.entries(stad.landscapes))
@@ -42,7 +45,9 @@
     strategy.tell(sample, fitness);
     const best = Math.min(history.at(-1).best, ...fitness);
     history.push({ mean: [...strategy.mean], best, sigma: strategy.sigma });
+    const runs = timer !== 0;
     show();
+    if (runs && finished()) stad.announce(stad.get("state").textContent);
   }
 
   /** Whether the points hardly differ any more. */

@@ -136,7 +136,9 @@ stad.start(async () => {
     const { phase } = state;
     get("live").dataset.phase = phase;
     get("card").hidden = phase === "race";
-    [get("again").hidden, get("share").hidden] = [phase === "attract", phase === "attract"];
+    get("again").hidden = false;
+    set("again", phase === "attract" ? "Start" : "Again");
+    get("share").hidden = phase === "attract";
     showPause();
     get("pause").disabled = phase === "over";
     get("eyes").disabled = get("auto").disabled = phase !== "race";
@@ -167,19 +169,22 @@ stad.start(async () => {
   /** How the reader begins or goes on, now: the last sentence of the card. */
   function showWay() {
     if (coming) return set("card-way", "The agent is being loaded.");
+    if (missing) return set("card-way", "It did not arrive: choose another one.");
     const keys = {
       attract: ["Touch the picture or press the up arrow", "to race it"],
       paused: ["Press P or an arrow key", "to go on"],
       over: ["Press the up arrow", "to race again"],
     }[state?.phase];
     if (!keys) return set("card-way", "");
-    const way = touching ? "Touch the picture" : released ? "Click the picture" : keys[0];
+    const click = state.phase === "paused" ? "Press P or click the picture" : "Click the picture";
+    const way = touching ? "Touch the picture" : released ? click : keys[0];
     set("card-way", `${way} ${keys[1]}.`);
   }
 
   function showStart() {
     const title = `Beat the ${driver ? "evolved driver" : "agent"}`;
-    showCard(title, "It drives alone until you start. You have 20 seconds.");
+    const until = still ? "It waits until you start." : "It drives alone until you start.";
+    showCard(title, `${until} You have 20 seconds.`);
   }
 
   function showEnd() {
@@ -250,12 +255,19 @@ stad.start(async () => {
   }
 
   function begin() {
-    if (coming) return; // the files would end the race when they arrive
+    // Files that arrive end a race; and without them another rival would drive.
+    if (coming || missing) return;
     released = false;
+    lookAtRace();
     wake();
     setAuto(false);
     worker.postMessage({ type: "begin", phase: "race" });
     get("seat").focus({ preventScroll: true });
+  }
+
+  /** Nobody is to drive what the window does not show. */
+  function lookAtRace() {
+    if (!seen) get("race").scrollIntoView({ block: "center" });
   }
 
   function toggleEyes() {
@@ -296,6 +308,7 @@ stad.start(async () => {
     if (state.phase !== "attract") return setPaused(true);
     still = !still;
     showPause();
+    showStart();
     rest();
   }
 
@@ -321,8 +334,9 @@ stad.start(async () => {
 
   /** A driver has touched a pedal: begin, or go on. */
   function wish() {
-    if (coming) return; // as above
+    if (coming || missing) return; // as above
     released = false;
+    lookAtRace();
     if (state?.phase === "attract") begin();
     else if (state?.phase === "paused") setPaused(false);
     // A key that was still held when the race ended begins no other.
@@ -457,17 +471,20 @@ stad.start(async () => {
   }
 
   function listenToControls() {
-    for (const id of ["card", "race"]) {
+    for (const id of ["card", "race", "again"])
       get(id).addEventListener("pointerdown", ({ pointerType }) => {
         touching = pointerType !== "mouse"; // not every browser tells it with the click
       });
+    for (const id of ["card", "race"])
       get(id).addEventListener("click", () => {
         wish();
         sendPedals();
       });
-    }
     get("easy").addEventListener("change", sendPedals);
-    get("again").addEventListener("click", begin);
+    get("again").addEventListener("click", () => {
+      begin();
+      sendPedals();
+    });
     get("another").addEventListener("click", () => {
       drive(Math.floor(Math.random() * 10000));
       writeAddress();
