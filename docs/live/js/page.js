@@ -53,14 +53,15 @@ addEventListener(
     }
   };
 
-  /** Put all of the page into a fieldset, which takes no input yet. */
+  /** Put the page, but for parts that wait for nothing, into a fieldset that takes no input yet. */
   function enclose() {
     const fieldset = document.createElement("fieldset");
     fieldset.setAttribute("role", "presentation");
     fieldset.disabled = fieldset.inert = true;
     const parts = [...stad.get("live").children];
-    fieldset.append(...parts.filter(({ id }) => id !== "message" && id !== "news"));
-    stad.get("live").append(fieldset);
+    const apart = parts.find((one) => one.matches("[data-apart]")) ?? null;
+    fieldset.append(...parts.filter((one) => !one.matches("#message, #news, [data-apart]")));
+    stad.get("live").insertBefore(fieldset, apart);
     return fieldset;
   }
 

@@ -3,9 +3,6 @@
 
 {
   const plane = stad.get("plane");
-  const figure = plane.closest(".figure"); // outside of `live`: it does not wait for the networks
-  stad.forget(figure);
-  stad.quieten(figure);
   const choices = ["landscape", "population", "sigma"].map(stad.get);
   const [landscapeBox, populationBox, sigmaBox] = choices;
   for (const [id, { name }] of Object.entries(stad.landscapes))
