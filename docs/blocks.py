@@ -198,7 +198,17 @@ def strongest(claims: dict) -> str:
     head = ("variant", "three seeds", "chosen agent", "minimum", "below 800", "goal reached")
     told = table((*head, "shipped before"), lines)
     outcome = "replaced, all together" if study["replaced"] else "kept"
-    return f"{told}\n\nThe four agents that were shipped before are {outcome}."
+    told += f"\n\nThe four agents that were shipped before are {outcome}."
+    return "\n".join([told, "", *map(place_of_failures, study["places"].items())]).rstrip()
+
+
+def place_of_failures(one: tuple[str, dict]) -> str:
+    """Where an agent of study 4 fails, and what follows, as an item of a list."""
+    variant, place = one
+    bends = f"{place['at a sharp bend']} of {place['failures']} failures begin at a sharp bend"
+    then = ", ".join(f"it {what}: {count}" for what, count in place["then"].items())
+    speed = f"which it reaches at {place['speed']:.0f} world units per second (median)"
+    return f"- `{variant}`: {bends}, {speed}. Then {then}."
 
 
 def outcomes(claims: dict) -> str:

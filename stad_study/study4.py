@@ -11,8 +11,8 @@ In the folder of the study::
 
 Whatever is there is not done again. A finished run is added to the tables. Of each variant the
 agent with the best validation is kept in `networks/study4`, to be shipped. After the last run the
-agents that are shipped now drive on the same tracks: they are replaced if they score less. That is
-done without `--only`, which does what it names.
+agents that are shipped now drive on the same tracks: they are replaced if they score less; and the
+failures of the kept agents are listed. That is done without `--only`, which does what it names.
 """
 
 import time
@@ -35,6 +35,7 @@ from stad_lab.training.pipeline import train
 from stad_lab.training.record import RECORD, provenance, starts, total_budget
 from stad_study import tables
 from stad_study.experiments import EXPERIMENTS
+from stad_study.failures import find_failures
 from stad_study.networks import NETWORKS
 from stad_study.ship import copy_in_half
 from stad_study.study import (
@@ -56,6 +57,7 @@ TRACKS = range(6000, 6400)  # of the score, with the fast renderer
 VALIDATION = 64  # tracks of a validation in the fine-tuning, by which agents are chosen
 STAGES = ("first", "second", "tuned")
 SHIPPED = "study4_shipped"  # the table of the agents that were shipped before
+FAILURES = "study4_failures"  # the table of where the kept agents fail
 
 
 class Run(NamedTuple):
@@ -113,6 +115,7 @@ def run_study4(
         raise ValueError(f"{', '.join(failed)}: not finished, for the reasons above")
     if not only and all(recorded(run, to) for run in find_runs()):
         score_shipped(root, to)
+        list_failures(root, to)
 
 
 def do_run(run: Run, root: Path, to: Path, repeat: bool) -> None:
@@ -179,6 +182,23 @@ def score_shipped(root: Path, to: Path) -> None:
             with locked(to, WAIT):
                 lines = pandas.DataFrame([line | returns_by_track(score)])
                 tables.replace_lines(SHIPPED, lines, to)
+
+
+def list_failures(root: Path, to: Path) -> None:
+    """List the failures of the kept agents in their table in `to`, but for those that it has."""
+    runs, known = (tables.read_or_empty(name, to) for name in (f"{NAME}_runs", FAILURES))
+    for variant, own in runs.groupby("variant"):
+        best = own.loc[own["validation"].idxmax()]
+        if best["below_800"] == 0 or variant in set(known["variant"]):
+            continue
+        with claimed(root / "failures" / variant) as ours, fixed_threads():
+            if not ours:
+                continue
+            agent = load_agent(to.parent / NETWORKS.name / NAME / variant)
+            if failures := find_failures(agent, TRACKS):  # none on another kind of processor
+                lines = pandas.DataFrame(failures).assign(seed=best["seed"], variant=variant)
+                with locked(to, WAIT):
+                    tables.replace_lines(FAILURES, lines, to)
 
 
 def returns_by_track(score: dict) -> dict[str, float]:

@@ -6,20 +6,23 @@ It is reported once all runs, and the agents shipped before, are in the tables.
 from pathlib import Path
 
 import numpy as np
+import pandas
 
 from stad_lab.config import VARIANTS
 from stad_lab.evaluation.statistics import FAILED
 from stad_study import tables
-from stad_study.study4 import SHIPPED, TRACKS, find_runs
+from stad_study.study4 import FAILURES, SHIPPED, TRACKS, find_runs
 
+SHARP = 90.0  # degrees within 20 tiles, from which on a bend is a sharp one
 GOAL = 930.0  # points in the mean, and no return below FAILED
 
 
 def describe_study4(folder: Path = tables.DATA) -> dict:
     """Progress; and after the last run "agents": variant -> its agent with the best validation.
 
-    Then also "shipped": the means of the four agents that were shipped before, and "replaced":
-    whether these score less. ValueError if a run has no return of each track.
+    Then also "places": variant -> where that agent fails; "shipped": the means of the four agents
+    that were shipped before; and "replaced": whether these score less.
+    ValueError if a run has no return of each track.
     """
     runs = tables.read_or_empty("study4_runs", folder).set_index(tables.AGENT)
     found: dict = {"runs": len(runs), "planned": len(find_runs())}
@@ -35,6 +38,10 @@ def describe_study4(folder: Path = tables.DATA) -> dict:
             "scores": own.sort_index()["mean"].tolist(),
         }
     found["shipped"] = shipped[[str(track) for track in TRACKS]].mean(axis=1).to_dict()
+    listed = tables.read_or_empty(FAILURES, folder)
+    found["places"] = {
+        variant: describe_places(own) for variant, own in listed.groupby("variant", sort=False)
+    }
     means = [one["mean"] for one in found["agents"].values()]
     found["replaced"] = bool(np.mean(means) > np.mean(list(found["shipped"].values())))
     return found
@@ -48,4 +55,14 @@ def describe_agent(returns: np.ndarray) -> dict:
         "minimum": lowest,
         "failures": int((returns < FAILED).sum()),
         "reached": mean >= GOAL and lowest >= FAILED,
+    }
+
+
+def describe_places(failures: pandas.DataFrame) -> dict:
+    """How many failures, how many at a sharp bend, the median speed there, and what followed."""
+    return {
+        "failures": len(failures),
+        "at a sharp bend": int((failures["bend"].abs() >= SHARP).sum()),
+        "speed": float(failures["speed"].median()),
+        "then": failures["then"].value_counts().to_dict(),
     }

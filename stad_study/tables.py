@@ -51,6 +51,7 @@ TABLES = {  # name -> columns that name a line, and others that each line must h
     "study4_runs": (AGENT, ["mean", "validation", "processor", "controller"]),
     "study4_returns": (AGENT, ["6000"]),
     "study4_shipped": (["variant"], ["processor", "controller", "6000"]),
+    "study4_failures": ([*AGENT, "track"], ["points", "tile", "bend", "speed", "then"]),
     "study5_runs": (SENSED, ["mean", "processor", "controller"]),
     "study5_returns": (SENSED, ["1000"]),
     "study_probe": ([*PIPELINE, "trained", "driver", "quantity"], ["r2"]),

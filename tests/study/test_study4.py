@@ -130,6 +130,10 @@ def test_of_a_variant_the_agent_with_the_best_validation_is_kept(made, tmp_path)
 
 
 def test_after_the_last_run_the_shipped_agents_drive_on_the_same_tracks_once(made, tmp_path):
+    folder, tmp_path = tmp_path, tmp_path / "data"
+    for variant in VARIANTS:
+        kept = folder / "networks/study4" / variant
+        shutil.copytree(made / "networks/study4/frame", kept)
     line = tables.read("study4_runs", made / "data")
     lines = [line.assign(**run._asdict()) for run in find_runs()]
     tables.save("study4_runs", pandas.concat(lines[:-1]), tmp_path)
@@ -143,6 +147,12 @@ def test_after_the_last_run_the_shipped_agents_drive_on_the_same_tracks_once(mad
         driven = drive_tracks(load_agent(variant), range(6000, 6003), 1, limits={"max_frames": 40})
         returns = [round(one["return"], 2) for one in driven["episodes"]]
         assert shipped.loc[variant, ["6000", "6001", "6002"]].tolist() == returns
+    failures = tables.read("study4_failures", tmp_path).set_index(["variant", "track"])
+    kept = study4.recorded(RUN, tmp_path), tables.read("study4_returns", made / "data")
+    assert kept[0]["below_800"] == 1  # in 40 frames nobody earns more
+    assert set(failures.index) == {(one, t) for one in VARIANTS for t in (6000, 6001, 6002)}
+    found = failures.loc["frame", "points"].tolist()
+    assert found == pytest.approx(kept[1][["6000", "6001", "6002"]].iloc[0].tolist(), abs=0.06)
     tables.save("study4_shipped", shipped.assign(controller="older").reset_index(), tmp_path)
     run_study4(tmp_path, to=tmp_path)
     assert set(tables.read("study4_shipped", tmp_path)["controller"]) == {"older"}

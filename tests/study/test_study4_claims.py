@@ -78,6 +78,26 @@ def test_the_shipped_agents_are_replaced_all_together_if_their_mean_is_lower(
     )
 
 
+def test_where_the_chosen_agents_fail_is_told_of_each(tmp_path):
+    write_tables(tmp_path, find_runs(), lambda run: [920.0] * len(TRACKS))
+    write_shipped(tmp_path, dict.fromkeys(VARIANTS, 930.0))
+    assert describe_study4(tmp_path)["places"] == {}
+    lines = [("frame", 6000, 120.0, "drives back"), ("frame", 6001, -95.0, "drives back")]
+    lines += [("frame", 6002, 20.0, "drives on"), ("input", 6000, 89.0, "leaves the field")]
+    names = ["variant", "track", "bend", "then"]
+    table = pandas.DataFrame(lines, columns=names).assign(seed=402, points=1.0, tile=5, speed=60.0)
+    tables.save("study4_failures", table, tmp_path)
+    found = describe_study4(tmp_path)
+    assert found["places"]["frame"] == {
+        "failures": 3,
+        "at a sharp bend": 2,
+        "speed": 60.0,
+        "then": {"drives back": 2, "drives on": 1},
+    }
+    told = blocks.strongest({"study4": found})
+    assert "`frame`: 2 of 3 failures" in told and "it leaves the field: 1." in told
+
+
 def test_a_run_without_all_its_returns_is_refused(tmp_path):
     write_tables(tmp_path, find_runs(), lambda run: [900.0] * len(TRACKS))
     write_shipped(tmp_path, dict.fromkeys(VARIANTS, 900.0))
