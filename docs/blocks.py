@@ -6,6 +6,7 @@ import itertools
 import json
 import re
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from stad_study.figures import (
     plot_study,
 )
 from stad_study.study import STUDIES
+from stad_study.study4_claims import SHARP
 from stad_study.study5 import ARMS
 from stad_study.study_claims import FAMILIES, FEATURES, MARGIN
 from stad_study.verdict import (
@@ -193,22 +195,27 @@ def strongest(claims: dict) -> str:
     for variant, one in study["agents"].items():
         scores = ", ".join(f"{score:.1f}" for score in one["scores"])
         cells = (f"`{variant}`", scores, f"{one['mean']:.1f}", f"{one['minimum']:.0f}")
-        cells += (str(one["failures"]), "yes" if one["reached"] else "no")
-        lines.append((*cells, f"{study['shipped'][variant]:.1f}"))
-    head = ("variant", "three seeds", "chosen agent", "minimum", "below 800", "goal reached")
-    told = table((*head, "shipped before"), lines)
+        sharp = study["places"].get(variant, {}).get("at a sharp bend", 0)
+        cells += (str(one["failures"]), str(sharp), f"{study['shipped'][variant]:.1f}")
+        lines.append(cells)
+    head = ("variant", "three seeds", "chosen agent", "minimum", "below 800")
+    told = [table((*head, f"of these at a bend of {SHARP:.0f} degrees", "shipped before"), lines)]
+    reached = [f"`{variant}`" for variant, one in study["agents"].items() if one["reached"]]
     outcome = "replaced, all together" if study["replaced"] else "kept"
-    told += f"\n\nThe four agents that were shipped before are {outcome}."
-    return "\n".join([told, "", *map(place_of_failures, study["places"].items())]).rstrip()
+    told.append(
+        f"The goal is reached by {', '.join(reached) or 'none'}. The four agents that were shipped"
+        f" before are {outcome}."
+    )
+    if study["places"]:
+        told.append(what_follows(study["places"]))
+    return "\n\n".join(told)
 
 
-def place_of_failures(one: tuple[str, dict]) -> str:
-    """Where an agent of study 4 fails, and what follows, as an item of a list."""
-    variant, place = one
-    bends = f"{place['at a sharp bend']} of {place['failures']} failures begin at a sharp bend"
-    then = ", ".join(f"it {what}: {count}" for what, count in place["then"].items())
-    speed = f"which it reaches at {place['speed']:.0f} world units per second (median)"
-    return f"- `{variant}`: {bends}, {speed}. Then {then}."
+def what_follows(places: dict[str, dict]) -> str:
+    """What the agents of study 4 do in their failures."""
+    counts: Counter[str] = sum((Counter(one["then"]) for one in places.values()), Counter())
+    told = ", ".join(f"{what} ({count})" for what, count in counts.most_common())
+    return f"After its mistake the car {told}."
 
 
 def outcomes(claims: dict) -> str:
