@@ -73,6 +73,30 @@ def test_the_score_is_of_the_agent_as_it_is_kept(made):
     assert line["agents"] == 3 * 2 * 4
 
 
+def test_a_run_stopped_in_every_stage_goes_on_and_gives_the_same_agent(
+    made, tmp_path, interrupt_after, monkeypatch
+):
+    def run():
+        run_study4(tmp_path, only=[RUN.name], to=tmp_path / "data")
+
+    for updates in (4, 5 + 2, 3 + 4, 5 + 2):  # in V and M of the first iteration and the second
+        with interrupt_after(updates):
+            run()
+    for step in ("fine_tune", "copy_in_half", "score_agent", "add_run"):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(study4, step, stop)
+            run()
+    run()
+    was, now = (study4.recorded(RUN, folder / "data") for folder in (made, tmp_path))
+    same = ("mean", "validation", "generation", "episodes", "frames", "controller")
+    assert [was[name] for name in same] == [now[name] for name in same]
+
+
+def stop(*_, **__):
+    """Stop, as Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
 def test_the_line_of_a_run_says_what_each_stage_and_the_score_were_made_with(made):
     line, here = study4.recorded(RUN, made / "data"), processor()
     stages = [f"processors.{stage}" for stage in ("dataset", *STAGES)]
