@@ -79,7 +79,7 @@ def compete(
         secret: The file of hidden tracks, made by `commit`.
         out: Folder of the results and of leaderboard.html.
         reveal: Print seeds and salt on the leaderboard.
-        baselines: Rank a random driver, a constant one and four shipped agents, too.
+        baselines: Rank random actions, constant ones and four shipped agents, too.
         processes: Submissions that drive at once.
         limits: What a submission may use.
     """

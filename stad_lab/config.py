@@ -2,8 +2,8 @@
 
 `Config.preset("laptop")` is the default; `quick` shows in a minute that everything works, `fast`
 trains V and M on less than `laptop` does, and `paper` is the budget that the paper states. A run's
-configuration is written into its folder. Each stage depends on its own part alone: another step
-size of CMA-ES leaves a trained V valid.
+configuration is written into its folder. A stage depends on no later one: another step size of
+CMA-ES leaves a trained V valid.
 
 The docstring below each field is its help on the command line. A field that is added later needs a
 default that means what the code did before, so that older runs stay valid.
@@ -123,7 +123,7 @@ class EvolutionConfig:
     step_size_rule: Literal["CSA", "TPA"] = "CSA"
     """How CMA-ES adapts sigma: cumulative step-size adaptation (World Models) or two-point."""
     components: int = 48
-    """Optimise along so many principal components of what C sees, at most; 0 for every weight."""
+    """Optimise at most this many principal components of what C sees; 0 for every weight."""
     features: Literal["z, h", "z", "h"] = "z, h"
     """What C sees: "z, h" with its quotes, z or h."""
     initial_gas: float = -0.5
