@@ -45,6 +45,29 @@ def one_thread():
     torch.set_num_threads(1)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def no_flush():
+    """No test cuts the power, and a flush waits for what all other tests write."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os.fsync", lambda opened: None)
+        yield
+
+
+# Files that take longest.
+LONG = (
+    *("test_docs.py", "00_first_drive.ipynb", "test_exercises.py", "test_browser.py"),
+    *("test_faults.py", "test_live_race.py", "test_live.py", "test_live_evolve.py"),
+    *("test_compete.py", "test_evolution.py", "test_dataset.py"),
+)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items):
+    """Long files begin first, so that no process has one left when the others have ended."""
+    order = {name: place for place, name in enumerate(LONG)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
+
+
 def pytest_xdist_auto_num_workers():
     """One process more than cores, because many tests wait for a browser, a kernel or a command.
 
@@ -300,17 +323,34 @@ def write_live_pages(folder):
             (folder / f"{file.stem}.html").write_text(head + style + body, encoding="utf-8")
 
 
+# The page draws in every third frame of the screen: a busy machine has better things to do.
+SELDOM = """{
+    const [ask, cancel, asked] = [requestAnimationFrame, cancelAnimationFrame, new Map()]
+    let last = 0
+    globalThis.requestAnimationFrame = (draw) => {
+        const own = ++last
+        const wait = (left) =>
+            asked.set(own, ask((now) => (left ? wait(left - 1) : (asked.delete(own), draw(now)))))
+        wait(2)
+        return own
+    }
+    globalThis.cancelAnimationFrame = (own) => (cancel(asked.get(own)), asked.delete(own))
+}"""
+
+
 @pytest.fixture
 def opened(browser, live_pages):
     """A function that opens a live page, at an address in it, and waits until it is ready.
 
-    No page may have an error, or ask a network; `loaded` has the addresses of all that it loads.
+    `script` runs before those of the page. No page may have an error, or ask a network; `loaded`
+    has the addresses of all that it loads.
     """
     errors, contexts = [], []
 
-    def open_page(name, address="", **context):
+    def open_page(name, address="", script="", **context):
         context.setdefault("viewport", {"width": 800, "height": 500})  # less to draw
         contexts.append(browser.new_context(**context))
+        contexts[-1].add_init_script(SELDOM + script)
         page = contexts[-1].new_page()
         page.set_default_timeout(60_000)  # milliseconds: a busy machine is no fault
         page.loaded = set()

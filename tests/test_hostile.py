@@ -6,6 +6,7 @@ arguments and files.
 
 import copy
 import dataclasses
+import functools
 import json
 import shutil
 
@@ -30,7 +31,6 @@ from stad_lab.io.weights import load_mdn_rnn, load_vae
 from stad_lab.training.dataset import Dataset
 
 REFUSALS = ValueError, OSError, RuntimeError, gym.error.Error
-AGENT = load_agent("input")
 QUIET = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
 
 scalars = st.one_of(
@@ -52,9 +52,15 @@ junk = st.one_of(
 )
 
 
+@functools.cache
+def shipped():
+    """The agent `input`. Every process of the tests reads this file, and one needs the agent."""
+    return load_agent("input")
+
+
 def acted():
     """An agent that drives two cars."""
-    agent = Agent(AGENT.world_model, AGENT.parameters)
+    agent = Agent(shipped().world_model, shipped().parameters)
     agent.act_batch(np.zeros((2, 96, 96, 3), np.uint8))
     return agent
 
@@ -81,7 +87,7 @@ BUDGET = 3  # frames: a larger number that is drawn is not driven
 
 def dreams(make):
     """A dream of the shipped V and M."""
-    return lambda **options: make(AGENT.vae, AGENT.mdn_rnn, **options)
+    return lambda **options: make(shipped().vae, shipped().mdn_rnn, **options)
 
 
 CALLS = {
@@ -119,12 +125,12 @@ CALLS = {
     "dreams step": lambda value: begun(dreams(DreamVector)(num_envs=2)).step(value),
     "make_dream": make_dream,
     "load_agent": load_agent,
-    "drive tracks": lambda value: drive(AGENT, value, max_frames=BUDGET),
-    "drive patience": lambda value: drive(AGENT, [1], max_frames=BUDGET, patience=value),
+    "drive tracks": lambda value: drive(shipped(), value, max_frames=BUDGET),
+    "drive patience": lambda value: drive(shipped(), [1], max_frames=BUDGET, patience=value),
     "act": lambda value: load_agent("input").act(value),
     "act_batch": lambda value: acted().act_batch(value),
     "keep": lambda value: acted().keep(value),
-    "parameters": lambda value: Agent(AGENT.world_model, value),
+    "parameters": lambda value: Agent(shipped().world_model, value),
     "check_tracks": lambda value: check_tracks(value, value),
     "preset": Config.preset,
     "from_dict": Config.from_dict,
@@ -134,7 +140,7 @@ CALLS = {
 
 def one_car():
     """An agent that has driven one car."""
-    agent = Agent(AGENT.world_model, AGENT.parameters)
+    agent = Agent(shipped().world_model, shipped().parameters)
     agent.act(np.zeros((96, 96, 3), np.uint8))
     return agent
 

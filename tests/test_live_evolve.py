@@ -25,6 +25,9 @@ FAIL_ONCE = """() => {
 TILE = 1000 / 200  # points; a track has more tiles
 
 
+SHORT = "globalThis.stad = { get LONGEST() { return 60 }, set LONGEST(_) {} }"  # frames
+
+
 def evolve(page, generations):
     """Drive so many more generations, one by one."""
     for _ in range(generations):
@@ -98,7 +101,7 @@ def test_networks_that_do_not_arrive_leave_the_evolution_as_it_was(evolved):
 
 
 def test_the_latest_few_evolutions_are_kept_and_a_link_goes_on_with_its_own(opened):
-    page = opened("evolve", SMALL)
+    page = opened("evolve", SMALL, SHORT)
     page.evaluate(OTHERS.replace("[4, 5, 4]", "[1, 2, 4, 5, 4]"))
     kept = page.evaluate("stad.evolveSettings.all.map(({ settings }) => settings.seed)")
     assert kept == [4, 5, 2]
@@ -165,7 +168,7 @@ def test_the_evolved_driver_is_the_rival_in_the_race_until_an_address_has_none(e
 
 
 def test_impatient_clicks_break_no_evolution(opened):
-    page = opened("evolve", SMALL, viewport={"width": 390, "height": 844})
+    page = opened("evolve", SMALL, SHORT, viewport={"width": 390, "height": 844})
     page.evaluate(
         """for (let i = 0; i < 60; i++) {
             const buttons = [...document.querySelectorAll("#live button")]

@@ -1,6 +1,7 @@
 """The competition: a submission costs itself alone, and a ranking can be continued and checked."""
 
 import contextlib
+import functools
 import json
 import os
 import shutil
@@ -27,7 +28,7 @@ from stad_course.compete.limits import Limits
 from stad_course.compete.process import LARGEST_SUBMISSION, Failure, Submission, can_isolate, copied
 from stad_course.compete.ranking import rank
 from stad_course.compete.tracks import hide_tracks
-from stad_lab.agent import PRETRAINED
+from stad_lab.agent import PRETRAINED, rollout
 from stad_lab.envs.cars import Cars
 from stad_lab.io.files import load_json, save_json
 
@@ -251,6 +252,14 @@ def test_what_would_cost_results_is_refused_in_one_line(arguments, expected, tmp
     assert agent.read_bytes() == (STARTER / "my_agent.py").read_bytes()
 
 
+@pytest.fixture
+def short_episodes(monkeypatch):
+    """Episodes of 30 frames, where a submission breaks down in the first picture."""
+    brief = functools.partial(rollout, max_frames=30)
+    monkeypatch.setattr("stad_course.compete.drive.rollout", brief)
+
+
+@pytest.mark.usefixtures("short_episodes")
 def test_each_track_on_which_a_submission_breaks_down_costs_that_track_alone(tmp_path):
     cars = Cars(2)
     cars.reset([3, 5])
@@ -281,6 +290,7 @@ LIE = """import os, contextlib
                 os.write(one, b'{"kind": "actions", "size": 24}' + bytes([10] + [0] * 24))"""
 
 
+@pytest.mark.usefixtures("short_episodes")
 @pytest.mark.parametrize(
     ("line", "tracks", "lost", "said"),
     [
