@@ -195,7 +195,8 @@ def strongest(claims: dict) -> str:
     for variant, one in study["agents"].items():
         scores = ", ".join(f"{score:.1f}" for score in one["scores"])
         cells = (f"`{variant}`", scores, f"{one['mean']:.1f}", f"{one['minimum']:.0f}")
-        sharp = study["places"].get(variant, {}).get("at a sharp bend", 0)
+        unknown = "not listed" if one["failures"] else 0
+        sharp = study["places"].get(variant, {}).get("at a sharp bend", unknown)
         cells += (str(one["failures"]), str(sharp), f"{study['shipped'][variant]:.1f}")
         lines.append(cells)
     head = ("variant", "three seeds", "chosen agent", "minimum", "below 800")

@@ -1,6 +1,6 @@
 """Where an agent fails: its episodes below 800 points, where they go wrong, and what follows.
 
-The place is where the longest row of tiles begins that the car never visits.
+The place is where the car begins to be longest without a new tile.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ class Failure(NamedTuple):
     points: float
     tiles: int  # of the track
     missed: int  # of these
-    tile: int  # the first of the longest row of missed ones
+    tile: int  # the place: the one after the last that the car reached
     bend: float  # the sharpest one there or just before, degrees to the left
     speed: float  # with which the car came to this bend, world units per second
     then: str  # what the car does next, see `what_follows`
@@ -71,19 +71,18 @@ def find_failures(agent: Agent, tracks: Sequence[int]) -> list[Failure]:
 def describe(notes: Notes, car: int, track: int, points: float, left: bool) -> Failure:
     """The place of a car's failure, and what follows; `left`: whether it left the field."""
     path = notes.cars.tracks[car].path  # of a tile: progress, direction, x, y
-    heading, count = np.unwrap(path[:, 1]), int(notes.cars.roads["tiles"][car])
-    missed = notes.cars.roads["visited"][car, :count] == 0
-    tile = longest_row(missed)
-    turned = heading[BEND:] - heading[:-BEND]  # from each tile on
-    begins = np.clip(np.arange(tile - BEFORE, tile + 1), 0, len(turned) - 1)
+    first, rows = notes.first[car, : len(path)], np.array(notes.rows[car])
+    leaves, tile = lost_at(first, len(rows), left)
+    turned = bends_of(path[:, 1])
+    begins = np.arange(max(0, tile - BEFORE), tile + 1)
     bend = begins[np.abs(turned[begins]).argmax()]
-    arrives, leaves = (reached(notes.first[car], at) for at in (bend, tile - 1))
-    rows = np.array(notes.rows[car])
+    visits = first[: bend + 1]
+    arrives = visits[(visits >= 0) & (visits <= leaves)].max()
     return Failure(
         track=track,
         points=round(float(points), 1),
-        tiles=count,
-        missed=int(missed.sum()),
+        tiles=len(path),
+        missed=int((notes.cars.roads["visited"][car, : len(path)] == 0).sum()),
         tile=tile,
         bend=round(float(np.degrees(turned[bend])), 1),
         speed=round(float(rows[arrives, SPEED]), 1),
@@ -91,24 +90,31 @@ def describe(notes: Notes, car: int, track: int, points: float, left: bool) -> F
     )
 
 
-def reached(first: np.ndarray, tile: int) -> int:
-    """The frame in which a car came to a tile, or if it missed that one, to the last one before.
+def lost_at(first: np.ndarray, frames: int, left: bool) -> tuple[int, int]:
+    """Where a car is longest without a new tile: the frame in which this begins, and the next tile.
 
-    `first` has the frame of the first visit of each tile, or -1.
+    Args:
+        first: the frame of the first visit of each tile, int (tiles,), or -1.
+        frames: of the episode.
+        left: whether the car left the field, which ends the episode: then the last such frame.
     """
-    visits = first[: max(tile, 0) + 1]
-    return int(visits[visits >= 0][-1]) if (visits >= 0).any() else 0
+    times = np.unique(first[first >= 0])
+    leaves = int(times[-1 if left else np.diff(times, append=frames).argmax()])
+    return leaves, (int(np.flatnonzero(first == leaves).max()) + 1) % len(first)
 
 
-def longest_row(missed: np.ndarray) -> int:
-    """The first tile of the longest row of missed ones, from bool (tiles,); 0 if there is none."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], missed.astype(int), [0]])))
-    begins, ends = edges[::2], edges[1::2]
-    return int(begins[(ends - begins).argmax()]) if len(begins) else 0
+def bends_of(direction: np.ndarray) -> np.ndarray:
+    """How far the road turns from each tile on within BEND tiles, radians to the left (tiles,)."""
+    heading = np.unwrap(direction)
+    step = (heading[0] - heading[-1] + np.pi) % (2 * np.pi) - np.pi  # over the start line
+    again = heading + heading[-1] + step - heading[0]
+    return np.append(heading, again)[BEND : BEND + len(heading)] - heading
 
 
 def what_follows(rows: np.ndarray, road: np.ndarray, tile: int) -> str:
     """What a car does after its mistake: the first of these that is true.
+
+    It drives on also where only its time has run out.
 
     Args:
         rows: motion and position in every frame from then on (frames, 8).
@@ -123,5 +129,7 @@ def what_follows(rows: np.ndarray, road: np.ndarray, tile: int) -> str:
         return "crosses the grass to another part of the road"
     if off.mean() > 0.5:
         return "stays off the road"
+    if len(np.unique(tiles)) < 3:
+        return "stands still"
     back = np.abs(rows[~off, HEADING]) > np.pi / 2
     return "drives back" if back.mean() > 0.5 else "drives on"

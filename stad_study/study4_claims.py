@@ -38,10 +38,7 @@ def describe_study4(folder: Path = tables.DATA) -> dict:
             "scores": own.sort_index()["mean"].tolist(),
         }
     found["shipped"] = shipped[[str(track) for track in TRACKS]].mean(axis=1).to_dict()
-    listed = tables.read_or_empty(FAILURES, folder)
-    found["places"] = {
-        variant: describe_places(own) for variant, own in listed.groupby("variant", sort=False)
-    }
+    found["places"] = describe_places(found["agents"], tables.read_or_empty(FAILURES, folder))
     means = [one["mean"] for one in found["agents"].values()]
     found["replaced"] = bool(np.mean(means) > np.mean(list(found["shipped"].values())))
     return found
@@ -58,7 +55,19 @@ def describe_agent(returns: np.ndarray) -> dict:
     }
 
 
-def describe_places(failures: pandas.DataFrame) -> dict:
+def describe_places(agents: dict[str, dict], listed: pandas.DataFrame) -> dict[str, dict]:
+    """Variant -> where its chosen agent fails, of those that do; empty until all are listed."""
+    places = {}
+    for variant, agent in agents.items():
+        own = listed[(listed["variant"] == variant) & (listed["seed"] == agent["seed"])]
+        if len(own) != agent["failures"]:
+            return {}
+        if len(own):
+            places[variant] = describe_place(own)
+    return places
+
+
+def describe_place(failures: pandas.DataFrame) -> dict:
     """How many failures, how many at a sharp bend, the median speed there, and what followed."""
     return {
         "failures": len(failures),

@@ -169,6 +169,19 @@ def test_no_race_begins_before_a_rival_that_loads_slowly_is_there(opened):
     page.wait_for_function("stad.page.state.you.frames > 10")
 
 
+def test_a_race_that_was_begun_goes_on_when_another_rival_does_not_arrive(opened):
+    page = opened("race", reduced_motion="reduce")
+    page.click("#again")
+    phase(page, "race")
+    page.evaluate("() => { stad.loadTensors = async () => { throw new Error('lost') } }")
+    page.select_option("#agent", "input")
+    page.wait_for_selector("#live[data-state=failed]")
+    page.click("#pause")
+    phase(page, "paused")
+    page.click("#pause")
+    phase(page, "race")
+
+
 def test_without_its_files_a_rival_is_not_raced_and_another_one_is(opened):
     page = opened("race", reduced_motion="reduce")
     phase(page, "attract")

@@ -183,8 +183,10 @@ def blas() -> str:
     `OPENBLAS_CORETYPE` can choose another kind, and with it other last bits.
     """
     found = [one for one in threadpool_info() if one["user_api"] == "blas"]
-    parts = ("internal_api", "version", "architecture")
-    return "; ".join(sorted({" ".join(str(one.get(part)) for part in parts) for one in found}))
+    # OpenCV and SciPy may have loaded others, from folders of their own.
+    ours = [one for one in found if "numpy" in "/".join(Path(one["filepath"]).parts[-3:-1])]
+    told = {f"{one['internal_api']} {one['version']} {one['architecture']}" for one in ours}
+    return "; ".join(sorted(told)) or "unknown"
 
 
 def describe_device() -> str:

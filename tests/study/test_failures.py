@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stad_lab.envs.cars import Cars
-from stad_study.failures import HEADING, find_failures, longest_row, reached, what_follows
+from stad_study.failures import HEADING, bends_of, find_failures, lost_at, what_follows
 
 ANGLES = np.linspace(0, 2 * np.pi, 200, endpoint=False)
 ROAD = 100 * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)  # a circle of 200 tiles
@@ -29,7 +29,9 @@ class Straight:
 
 
 def test_a_car_that_drives_straight_on_fails_at_the_first_bend_and_does_not_come_back():
-    for one in find_failures(Straight(), [1, 2, 3]):
+    found = find_failures(Straight(), [1, 2, 3])
+    assert [one.track for one in found] == [1, 2, 3]
+    for one in found:
         cars = Cars(1)
         cars.reset([one.track])
         road = cars.tracks[0].path[:, 2:]
@@ -54,6 +56,7 @@ def rows_of(positions, heading):
         (ROAD[20:80], 0.1, "drives on"),
         (ROAD[25::-1], 3.0, "drives back"),
         (1.3 * ROAD[20:80], 0.1, "stays off the road"),
+        (ROAD[[20, 21, 21, 21]], 0.1, "stands still"),
         (
             np.concatenate([ROAD[15:21], np.linspace(ROAD[20], ROAD[120], 80), ROAD[120:180]]),
             0.1,
@@ -65,8 +68,14 @@ def test_what_follows_a_mistake_is_told_from_the_path(positions, heading, expect
     assert what_follows(rows_of(positions, heading), ROAD, 20) == expected
 
 
-def test_the_place_is_the_longest_row_of_missed_tiles_and_the_last_one_reached_before():
-    missed = np.array([0, 1, 0, 0, 1, 1, 1, 0, 1], bool)
-    assert longest_row(missed) == 4 and longest_row(np.zeros(5, bool)) == 0
-    first = np.array([0, -1, 12, 15, -1, -1])
-    assert [reached(first, tile) for tile in (-1, 0, 1, 2, 5)] == [0, 0, 0, 12, 15]
+def test_the_place_is_where_a_car_is_longest_without_a_new_tile_even_if_it_comes_back_later():
+    first = np.array([0, 0, 5, 9, -1, -1, 60, 62, -1])  # it comes back over later tiles
+    assert lost_at(first, 70, left=False) == (9, 4)
+    assert lost_at(first, 70, left=True) == (62, 8)
+    assert lost_at(np.array([0, 2, 4]), 90, left=False) == (4, 0)
+
+
+def test_a_bend_over_the_start_line_is_measured():
+    turned = bends_of(ANGLES + 0.3)
+    assert np.allclose(turned, 20 * 2 * np.pi / 200)
+    assert np.allclose(bends_of(-ANGLES), -turned)

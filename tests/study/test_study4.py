@@ -153,7 +153,9 @@ def test_of_a_variant_the_agent_with_the_best_validation_is_kept(made, tmp_path)
         assert len(tables.read("study4_runs", tmp_path / "data")) == 2
 
 
-def test_after_the_last_run_the_shipped_agents_drive_on_the_same_tracks_once(made, tmp_path):
+def test_after_the_last_run_the_shipped_agents_drive_on_the_same_tracks_once(
+    made, tmp_path, monkeypatch
+):
     folder, tmp_path = tmp_path, tmp_path / "data"
     for variant in VARIANTS:
         kept = folder / "networks/study4" / variant
@@ -178,8 +180,13 @@ def test_after_the_last_run_the_shipped_agents_drive_on_the_same_tracks_once(mad
     found = failures.loc["frame", "points"].tolist()
     assert found == pytest.approx(kept[1][["6000", "6001", "6002"]].iloc[0].tolist(), abs=0.06)
     tables.save("study4_shipped", shipped.assign(controller="older").reset_index(), tmp_path)
+    listed = tables.read("study4_failures", tmp_path)
+    tables.save("study4_failures", listed[listed["variant"] != "frame"], tmp_path)
     run_study4(tmp_path, to=tmp_path)
     assert set(tables.read("study4_shipped", tmp_path)["controller"]) == {"older"}
+    assert len(tables.read("study4_failures", tmp_path)) == len(listed)  # the missing ones
+    monkeypatch.setattr(study4, "find_failures", stop)
+    run_study4(tmp_path, to=tmp_path)
 
 
 def test_bad_names_and_options_are_refused_in_one_line(tmp_path, capsys):

@@ -81,13 +81,23 @@ def test_the_shipped_agents_are_replaced_all_together_if_their_mean_is_lower(
 
 
 def test_where_the_chosen_agents_fail_is_told_of_each(tmp_path):
-    write_tables(tmp_path, find_runs(), lambda run: [920.0] * len(TRACKS))
+    failures = {"frame": 3, "input": 1, "output": 0, "input_output": 0}
+
+    def returns_of(run):
+        count = failures[run.variant]
+        return [700.0] * count + [920.0] * (len(TRACKS) - count)
+
+    write_tables(tmp_path, find_runs(), returns_of)
     write_shipped(tmp_path, dict.fromkeys(VARIANTS, 930.0))
-    assert describe_study4(tmp_path)["places"] == {}
+    found = describe_study4(tmp_path)
+    assert found["places"] == {}  # none is listed yet
+    assert "| 3 | not listed | 930.0 |" in blocks.strongest({"study4": found})
     lines = [("frame", 6000, 120.0, "drives back"), ("frame", 6001, -95.0, "drives back")]
     lines += [("frame", 6002, 20.0, "drives on"), ("input", 6000, 89.0, "leaves the field")]
     names = ["variant", "track", "bend", "then"]
     table = pandas.DataFrame(lines, columns=names).assign(seed=402, points=1.0, tile=5, speed=60.0)
+    tables.save("study4_failures", table.iloc[:-1], tmp_path)
+    assert describe_study4(tmp_path)["places"] == {}  # nor all
     tables.save("study4_failures", table, tmp_path)
     found = describe_study4(tmp_path)
     assert found["places"]["frame"] == {

@@ -169,7 +169,8 @@ stad.start(async () => {
   /** How the reader begins or goes on, now: the last sentence of the card. */
   function showWay() {
     if (coming) return set("card-way", "The agent is being loaded.");
-    if (missing) return set("card-way", "It did not arrive: choose another one.");
+    if (missing && state?.phase !== "paused")
+      return set("card-way", "It did not arrive: choose another one.");
     const keys = {
       attract: ["Touch the picture or press the up arrow", "to race it"],
       paused: ["Press P or an arrow key", "to go on"],
@@ -267,7 +268,7 @@ stad.start(async () => {
 
   /** Nobody is to drive what the window does not show. */
   function lookAtRace() {
-    if (!seen) get("race").scrollIntoView({ block: "center" });
+    if (!seen) get("race").scrollIntoView({ block: "center", behavior: "instant" });
   }
 
   function toggleEyes() {
@@ -334,7 +335,7 @@ stad.start(async () => {
 
   /** A driver has touched a pedal: begin, or go on. */
   function wish() {
-    if (coming || missing) return; // as above
+    if (coming || (missing && state?.phase !== "paused")) return; // as above
     released = false;
     lookAtRace();
     if (state?.phase === "attract") begin();
