@@ -86,6 +86,22 @@ def test_after_a_reload_evolution_goes_on_as_it_would_have(evolved):
     assert page.evaluate(LOG, done + 1) == resumed
 
 
+STOP = """() => {
+    const [run, step] = ["run", "step"].map(stad.get)
+    run.click()
+    const before = step.textContent
+    step.click()
+    return [before, step.textContent]
+}"""
+
+
+def test_the_button_that_stops_after_a_generation_says_that_it_will(evolved):
+    done = evolved.evaluate("stad.page.log.length")
+    assert evolved.evaluate(STOP) == ["Stop after this generation", "Stops after this generation"]
+    evolved.wait_for_function("!stad.page.busy")
+    assert evolved.evaluate("stad.page.log.length") <= done + 1  # none, if none had begun
+
+
 def test_networks_that_do_not_arrive_leave_the_evolution_as_it_was(evolved):
     page, done = evolved, evolved.evaluate("stad.page.log.length")
     page.evaluate(LOSE)

@@ -29,6 +29,7 @@ stad.start(async () => {
     const own = run;
     while (wanted > 0 && own === run) {
       wanted -= 1;
+      showButtons();
       await generation(own);
     }
   }
@@ -153,7 +154,8 @@ stad.start(async () => {
     const begun = log.length > 0 || driving !== null;
     get("run").textContent = driving && paused === null ? "Pause" : begun ? "Go on" : "Start";
     get("bet-value").textContent = bet ?? "?";
-    get("step").textContent = driving ? "Stop after this generation" : "One generation";
+    const stops = wanted > 0 ? "Stop after this generation" : "Stops after this generation";
+    get("step").textContent = driving ? stops : "One generation";
     get("bet").value = bet ?? 0;
     get("bet").setAttribute("aria-valuetext", bet ?? "no bet yet");
     get("bet").disabled = begun;
